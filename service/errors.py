@@ -1,0 +1,118 @@
+"""Every error the service answers with, in one tree.
+
+CamindError
+├── BadRequest (422)           what was sent cannot be used
+│   ├── InvalidImage           the bytes are no whole image
+│   └── ImageSizeMismatch      not the camera's frame
+├── NotFound (404)
+├── Conflict (409)
+├── PreconditionFailed (412)   If-Match names another revision
+├── TooLarge (413)             too many bytes or pixels
+├── UnsupportedKind (415)      a media type or file kind that is not listed
+├── NotAcceptable (406)        no representation fits Accept
+├── Busy (503)                 the queue is full, or the deadline passed
+└── NotReady (503)             a part of the service is not up
+
+Domain code raises these and knows no HTTP beyond the class; one handler turns them into problem+json.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+
+@dataclass(frozen=True, slots=True)
+class FieldProblem:
+    """One fault at one place: a JSON pointer (``#/lens/f_number``), header or parameter name, and what to do."""
+
+    pointer: str
+    detail: str
+
+
+class CamindError(Exception):
+    """Base: a status, a stable code (the end of ``type``), a title, and what is wrong with what to do."""
+
+    status: ClassVar[int] = 500
+    code: ClassVar[str] = "internal-error"
+    title: ClassVar[str] = "Internal error"
+
+    def __init__(self, detail: str, *, errors: tuple[FieldProblem, ...] = ()) -> None:
+        super().__init__(detail)
+        self.detail = detail
+        self.errors = errors
+
+    @property
+    def headers(self) -> dict[str, str]:
+        """Headers that belong to this error."""
+        return {}
+
+
+class BadRequest(CamindError):
+    status = 422
+    code = "invalid-request"
+    title = "Invalid request"
+
+
+class InvalidImage(BadRequest):
+    code = "invalid-image"
+    title = "Invalid image"
+
+
+class ImageSizeMismatch(BadRequest):
+    code = "image-size-mismatch"
+    title = "Image is not the camera's frame"
+
+
+class NotFound(CamindError):
+    status = 404
+    code = "not-found"
+    title = "Not found"
+
+
+class Conflict(CamindError):
+    status = 409
+    code = "conflict"
+    title = "Conflict"
+
+
+class PreconditionFailed(CamindError):
+    status = 412
+    code = "precondition-failed"
+    title = "Precondition failed"
+
+
+class TooLarge(CamindError):
+    status = 413
+    code = "too-large"
+    title = "Too large"
+
+
+class UnsupportedKind(CamindError):
+    status = 415
+    code = "unsupported-kind"
+    title = "Unsupported kind"
+
+
+class NotAcceptable(CamindError):
+    status = 406
+    code = "not-acceptable"
+    title = "Not acceptable"
+
+
+class Busy(CamindError):
+    status = 503
+    code = "busy"
+    title = "Busy"
+
+    def __init__(self, detail: str, *, retry_after_s: int = 1) -> None:
+        super().__init__(detail)
+        self.retry_after_s = retry_after_s
+
+    @property
+    def headers(self) -> dict[str, str]:
+        return {"Retry-After": str(self.retry_after_s)}
+
+
+class NotReady(CamindError):
+    status = 503
+    code = "not-ready"
+    title = "Not ready"

@@ -1,0 +1,134 @@
+"""A camera as depth needs it: blur constants at a stated image size, focus distance and intrinsics."""
+
+import math
+from dataclasses import dataclass, replace
+
+from service.optics import thin_lens
+
+RANGE_BLUR_ERROR_PX = 0.25
+RANGE_DEPTH_ERROR = 0.1
+ASPECT_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """Raw lens specs (eq. 2). The focal length is the real one, never the 35-mm equivalent."""
+
+    focal_length_mm: float
+    f_number: float
+    pixel_pitch_um: float
+    sensor_width_px: int
+    k_r: float = 4.0
+
+    @property
+    def focal_length_m(self) -> float:
+        return self.focal_length_mm * 1e-3
+
+    def k_cam_px(self, focus_distance_m: float, image_width_px: int) -> float:
+        """k_cam at the given focus distance and image width; ``ValueError`` if f >= s1."""
+        return thin_lens.k_cam(
+            self.focal_length_m,
+            self.f_number,
+            focus_distance_m,
+            self.pixel_pitch_um * 1e-6,
+            image_width_px / self.sensor_width_px,
+            self.k_r,
+        )
+
+    def fx_px(self, image_width_px: int) -> float:
+        """Focal length in pixels of an image of the given width (infinity focus)."""
+        return self.focal_length_mm * 1e3 / self.pixel_pitch_um * image_width_px / self.sensor_width_px
+
+
+@dataclass(frozen=True, slots=True)
+class Intrinsics:
+    """Pinhole intrinsics in pixels; pixel (0, 0) is the centre of the top left pixel."""
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    distortion: tuple[float, ...] = ()
+
+    def scaled(self, x_ratio: float, y_ratio: float) -> "Intrinsics":
+        """The same camera after a resize by these ratios; distortion has no unit and stays."""
+        return Intrinsics(
+            self.fx_px * x_ratio,
+            self.fy_px * y_ratio,
+            (self.cx_px + 0.5) * x_ratio - 0.5,
+            (self.cy_px + 0.5) * y_ratio - 0.5,
+            self.distortion,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """What turns blur into metres, at one image size and one focus distance.
+
+    ``k_cam_px`` and ``gamma_px`` hold at ``image_width_px``. ``focal_length_m`` (real, not equivalent) is
+    needed only to move the focus exactly. Raises ``ValueError`` naming the field that is out of bounds.
+    """
+
+    image_width_px: int
+    image_height_px: int
+    focus_distance_m: float
+    k_cam_px: float
+    gamma_px: float = 0.5
+    focal_length_m: float | None = None
+    intrinsics: Intrinsics | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("image_width_px", "image_height_px", "focus_distance_m", "k_cam_px"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name} must be a positive number, not {value}")
+        if not (math.isfinite(self.gamma_px) and self.gamma_px >= 0):
+            raise ValueError(f"gamma_px must be zero or a positive number, not {self.gamma_px}")
+        if self.focal_length_m is not None and not 0 < self.focal_length_m < self.focus_distance_m:
+            raise ValueError("focal_length_m must be positive and shorter than focus_distance_m")
+
+    @property
+    def range_m(self) -> tuple[float, float]:
+        """Nearest and farthest depth where 0.25 px of blur error moves the depth by less than 10 %."""
+        far = thin_lens.farthest_depth(
+            self.focus_distance_m, self.k_cam_px, RANGE_BLUR_ERROR_PX, RANGE_DEPTH_ERROR
+        )
+        return min(self.focal_length_m or 0.0, far), far
+
+    def is_same_frame(self, width_px: int, height_px: int) -> bool:
+        """Whether an image of this size can be this camera's whole frame, resized (same aspect to 1 %)."""
+        aspect = (width_px / height_px) / (self.image_width_px / self.image_height_px)
+        # one pixel of rounding is no crop, however small the copy is
+        rounding = 0.5 / width_px + 0.5 / height_px
+        return abs(aspect - 1) <= ASPECT_TOLERANCE + rounding
+
+    def resized(self, width_px: int, height_px: int) -> "Camera":
+        """The camera behind the same frame at another size: k_cam, gamma and intrinsics scale, x does not."""
+        if (width_px, height_px) == (self.image_width_px, self.image_height_px):
+            return self
+        ratio = width_px / self.image_width_px
+        scaled = self.intrinsics and self.intrinsics.scaled(ratio, height_px / self.image_height_px)
+        return replace(
+            self,
+            image_width_px=width_px,
+            image_height_px=height_px,
+            k_cam_px=self.k_cam_px * ratio,
+            gamma_px=self.gamma_px * ratio,
+            intrinsics=scaled,
+        )
+
+    def focused_at(self, focus_distance_m: float) -> "Camera":
+        """The same camera focused elsewhere; without a known focal length f << s1 is assumed.
+
+        Raises ``ValueError`` if the lens cannot focus there.
+        """
+        if not (math.isfinite(focus_distance_m) and focus_distance_m > 0):
+            raise ValueError(f"focus_distance_m must be a positive number, not {focus_distance_m}")
+        k_cam_px = thin_lens.k_cam_at_focus(
+            self.k_cam_px, self.focal_length_m or 0.0, self.focus_distance_m, focus_distance_m
+        )
+        return replace(self, k_cam_px=k_cam_px, focus_distance_m=focus_distance_m)
+
+    def blur_px(self, depth_m: float) -> float:
+        """lambda this camera shows at a depth."""
+        return thin_lens.blur_at_depth(depth_m, self.focus_distance_m, self.k_cam_px, self.gamma_px)

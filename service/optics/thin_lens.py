@@ -1,0 +1,144 @@
+"""The thin lens: distance to blur and back.
+
+Everything here is written with ``+ - * / **`` and ``abs`` only, so one function serves a float, a NumPy
+array and a torch tensor alike, element by element, and gradients flow through it. No array library is
+imported. Symbols, units and signs are those of ``docs/conventions.md``; "eq." numbers are the paper's.
+"""
+
+from typing import Any, Protocol, TypeVar
+
+
+class Arithmetic(Protocol):
+    """What passes through the formulas: float, ndarray and Tensor differ in their stubs, not in this."""
+
+    def __add__(self, other: Any, /) -> Any: ...
+    def __sub__(self, other: Any, /) -> Any: ...
+    def __rsub__(self, other: Any, /) -> Any: ...
+    def __mul__(self, other: Any, /) -> Any: ...
+    def __rmul__(self, other: Any, /) -> Any: ...
+    def __truediv__(self, other: Any, /) -> Any: ...
+    def __rtruediv__(self, other: Any, /) -> Any: ...
+    def __abs__(self) -> Any: ...
+
+
+Q = TypeVar("Q", bound=Arithmetic)
+
+
+def k_cam(
+    focal_length_m: float,
+    f_number: float,
+    focus_distance_m: float,
+    pixel_pitch_m: float,
+    width_ratio: float = 1.0,
+    k_r: float = 4.0,
+) -> float:
+    """Blur in pixels per unit of relative defocus, from lens specs (eq. 2 and 3).
+
+    ``width_ratio`` is image width over sensor width, in pixels: linear, never a pixel count.
+    ``k_r`` turns the diameter of the circle of confusion into a standard deviation; a uniform disc has 4.
+    Raises ``ValueError`` if the lens cannot focus there (f >= s1).
+    """
+    if focal_length_m >= focus_distance_m:
+        raise ValueError("the focal length must be shorter than the focus distance")
+    aperture_m = focal_length_m / f_number
+    return aperture_m * focal_length_m / (focus_distance_m - focal_length_m) / pixel_pitch_m * width_ratio / k_r
+
+
+def relative_defocus(depth_m: Q, focus_distance_m: Q | float) -> Q:
+    """x = |s1 - z| / z, without unit: 0 in focus, unbounded nearer, below 1 beyond."""
+    x: Q = abs(focus_distance_m - depth_m) / depth_m
+    return x
+
+
+def signed_defocus(depth_m: Q, focus_distance_m: Q | float) -> Q:
+    """d = 1 - s1 / z: negative nearer than focus, 0 in focus, positive (below 1) beyond."""
+    d: Q = (depth_m - focus_distance_m) / depth_m
+    return d
+
+
+def defocus_at_depth(depth_m: Q, focus_distance_m: Q | float, k_cam_px: Q | float) -> Q:
+    """sigma in pixels of a point at depth z (eq. 3)."""
+    sigma: Q = relative_defocus(depth_m, focus_distance_m) * k_cam_px
+    return sigma
+
+
+def blur_from_defocus(defocus_px: Q, gamma_px: Q | float) -> Q:
+    """lambda = sqrt(sigma^2 + gamma^2) in pixels: what the image shows (eq. 5)."""
+    blur: Q = (defocus_px * defocus_px + gamma_px * gamma_px) ** 0.5
+    return blur
+
+
+def blur_at_depth(depth_m: Q, focus_distance_m: Q | float, k_cam_px: Q | float, gamma_px: Q | float) -> Q:
+    """lambda in pixels of a point at depth z (eq. 3 and 5)."""
+    return blur_from_defocus(defocus_at_depth(depth_m, focus_distance_m, k_cam_px), gamma_px)
+
+
+def defocus_from_blur(blur_px: Q, gamma_px: Q | float, floor_px: float = 0.0) -> Q:
+    """sigma = sqrt(max(lambda^2 - gamma^2, 0)) in pixels (eq. 6).
+
+    ``floor_px`` is added in quadrature: the square root has an infinite gradient at 0, so training passes
+    a small positive floor; a request passes none.
+    """
+    variance = blur_px * blur_px - gamma_px * gamma_px
+    sigma: Q = ((variance + abs(variance)) / 2.0 + floor_px * floor_px) ** 0.5
+    return sigma
+
+
+def relative_defocus_from_blur(
+    blur_px: Q, gamma_px: Q | float, k_cam_px: Q | float, floor_px: float = 0.0
+) -> Q:
+    """x = sqrt(lambda^2 - gamma^2) / k_cam, without unit (eq. 7)."""
+    x: Q = defocus_from_blur(blur_px, gamma_px, floor_px) / k_cam_px
+    return x
+
+
+def relative_defocus_spread(
+    blur_px: Q, relative_error: Q, gamma_px: Q | float, k_cam_px: Q | float, floor_px: float = 0.0
+) -> Q:
+    """Half the change of x when lambda moves up and down by ``relative_error`` (a fraction of lambda).
+
+    A finite difference and not a derivative, because at focus the derivative is infinite and the spread is not.
+    """
+    low = blur_px / (relative_error + 1.0)
+    high = blur_px * (relative_error + 1.0)
+    x_low = relative_defocus_from_blur(low, gamma_px, k_cam_px, floor_px)
+    x_high = relative_defocus_from_blur(high, gamma_px, k_cam_px, floor_px)
+    spread: Q = (x_high - x_low) / 2.0
+    return spread
+
+
+def depth_near(relative_defocus: Q, focus_distance_m: Q | float) -> Q:
+    """z = s1 / (1 + x) in metres: the answer on the near side, for every x >= 0."""
+    z: Q = focus_distance_m / (relative_defocus + 1.0)
+    return z
+
+
+def depth_far(relative_defocus: Q, focus_distance_m: Q | float) -> Q:
+    """z = s1 / (1 - x) in metres: the answer on the far side, which exists only for x < 1."""
+    z: Q = focus_distance_m / (1.0 - relative_defocus)
+    return z
+
+
+def depth_error(
+    depth_m: Q, focus_distance_m: Q | float, k_cam_px: Q | float, defocus_error_px: Q | float
+) -> Q:
+    """dz = z^2 / (s1 k_cam) dsigma in metres: the floor under every depth error."""
+    dz: Q = depth_m * depth_m / (focus_distance_m * k_cam_px) * defocus_error_px
+    return dz
+
+
+def farthest_depth(
+    focus_distance_m: float, k_cam_px: float, defocus_error_px: float, relative_depth_error: float
+) -> float:
+    """The depth in metres up to which ``defocus_error_px`` moves z by less than the given fraction of z."""
+    return relative_depth_error * focus_distance_m * k_cam_px / defocus_error_px
+
+
+def k_cam_at_focus(k_cam_px: float, focal_length_m: float, old_focus_m: float, new_focus_m: float) -> float:
+    """k_cam after the same lens is focused elsewhere: it scales with 1 / (s1 - f) (eq. 2).
+
+    Raises ``ValueError`` if the lens cannot focus there (f >= s1).
+    """
+    if focal_length_m >= min(old_focus_m, new_focus_m):
+        raise ValueError("the focal length must be shorter than the focus distance")
+    return k_cam_px * (old_focus_m - focal_length_m) / (new_focus_m - focal_length_m)
