@@ -5,6 +5,8 @@ CamindError
 │   ├── InvalidImage           the bytes are no whole image
 │   └── ImageSizeMismatch      not the camera's frame
 ├── NotFound (404)
+├── MethodNotAllowed (405)     the path exists, the method does not
+├── ReceiveTimeout (408)       the request came too slowly
 ├── Conflict (409)
 ├── PreconditionFailed (412)   If-Match names another revision
 ├── TooLarge (413)             too many bytes or pixels
@@ -66,6 +68,26 @@ class NotFound(CamindError):
     status = 404
     code = "not-found"
     title = "Not found"
+
+
+class MethodNotAllowed(CamindError):
+    status = 405
+    code = "method-not-allowed"
+    title = "Method not allowed"
+
+    def __init__(self, detail: str, *, allow: tuple[str, ...]) -> None:
+        super().__init__(detail)
+        self.allow = allow
+
+    @property
+    def headers(self) -> dict[str, str]:
+        return {"Allow": ", ".join(self.allow)}
+
+
+class ReceiveTimeout(CamindError):
+    status = 408
+    code = "receive-timeout"
+    title = "Request came too slowly"
 
 
 class Conflict(CamindError):

@@ -1,0 +1,59 @@
+"""What routes ask for, taken from the running app: nothing here is built at import."""
+
+from typing import Annotated
+
+from fastapi import Depends, Request
+
+from service.api.metrics import Metrics
+from service.config import Settings
+from service.errors import UnsupportedKind
+from service.inference.artifact import ModelFolder
+from service.inference.estimator import Estimator
+from service.inference.worker import Worker
+from service.storage.cameras import Cameras
+
+
+def get_settings(request: Request) -> Settings:
+    settings: Settings = request.app.state.settings
+    return settings
+
+
+def get_cameras(request: Request) -> Cameras:
+    cameras: Cameras = request.app.state.cameras
+    return cameras
+
+
+def get_model(request: Request) -> ModelFolder:
+    model: ModelFolder = request.app.state.model
+    return model
+
+
+def get_estimator(request: Request) -> Estimator:
+    estimator: Estimator = request.app.state.estimator
+    return estimator
+
+
+def get_worker(request: Request) -> Worker:
+    worker: Worker = request.app.state.worker
+    return worker
+
+
+def get_metrics(request: Request) -> Metrics:
+    metrics: Metrics = request.app.state.metrics
+    return metrics
+
+
+async def require_json(request: Request) -> None:
+    """Refuse a body that does not say it is JSON; an empty one is left to validation."""
+    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    is_json = kind == "application/json" or (kind.startswith("application/") and kind.endswith("+json"))
+    if not is_json and (kind or await request.body()):
+        raise UnsupportedKind(f"Send application/json, not {kind or 'a body without Content-Type'}.")
+
+
+SettingsDep = Annotated[Settings, Depends(get_settings)]
+CamerasDep = Annotated[Cameras, Depends(get_cameras)]
+ModelDep = Annotated[ModelFolder, Depends(get_model)]
+EstimatorDep = Annotated[Estimator, Depends(get_estimator)]
+WorkerDep = Annotated[Worker, Depends(get_worker)]
+MetricsDep = Annotated[Metrics, Depends(get_metrics)]

@@ -1,0 +1,155 @@
+"""Errors on the wire: every one is problem+json (RFC 9457), and every route documents the ones it raises."""
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
+
+from pydantic import BaseModel, Field
+from starlette.responses import Response
+
+from service.errors import BadRequest, CamindError, FieldProblem
+
+PROBLEM_TYPE = "application/problem+json"
+TYPE_PREFIX = "urn:camind:problem:"
+MAX_ERRORS = 50
+
+
+class ProblemField(BaseModel):
+    """One fault at one place."""
+
+    pointer: Annotated[
+        str,
+        Field(
+            description="JSON pointer into the body (`#/lens/f_number`), or a parameter's or header's name"
+        ),
+    ]
+    detail: str
+
+
+class Problem(BaseModel):
+    """RFC 9457 problem details."""
+
+    type: Annotated[str, Field(description="Stable name of the kind of problem")]
+    title: str
+    status: int
+    detail: Annotated[str, Field(description="What is wrong, and what to do")]
+    errors: Annotated[list[ProblemField] | None, Field(description="The fields at fault, if any")] = None
+
+
+def problem(error: CamindError) -> Problem:
+    """The error as problem details."""
+    errors = [ProblemField(pointer=item.pointer, detail=item.detail) for item in error.errors[:MAX_ERRORS]]
+    return Problem(
+        type=TYPE_PREFIX + error.code,
+        title=error.title,
+        status=error.status,
+        detail=error.detail,
+        errors=errors or None,
+    )
+
+
+def problem_response(error: CamindError, headers: Mapping[str, str] | None = None) -> Response:
+    """The error as a response, with the headers that belong to it."""
+    return Response(
+        problem(error).model_dump_json(exclude_none=True),
+        status_code=error.status,
+        media_type=PROBLEM_TYPE,
+        headers={"Cache-Control": "no-store", **(headers or {}), **error.headers},
+    )
+
+
+EXAMPLES: dict[str, tuple[str, tuple[FieldProblem, ...]]] = {
+    "invalid-request": (
+        "lens.focal_length_mm: Input should be greater than 0",
+        (FieldProblem("#/lens/focal_length_mm", "Input should be greater than 0"),),
+    ),
+    "invalid-image": ("The JPEG ends before its last row: send the whole file.", ()),
+    "image-size-mismatch": (
+        "The image is 640 x 480 and camera 'd200' is 645 x 432: send the whole frame, resized at most.",
+        (),
+    ),
+    "not-found": ("There is no camera 'd200'.", ()),
+    "conflict": ("A camera 'd200' exists already: replace it with PUT /cameras/d200.", ()),
+    "precondition-failed": ("Camera 'd200' is at revision 3: read it again, then repeat.", ()),
+    "too-large": ("The request body may have at most 40000000 bytes.", ()),
+    "unsupported-kind": ("Send application/json, not text/plain.", ()),
+    "not-acceptable": ("No format fits Accept: text/csv.", ()),
+    "receive-timeout": ("The request body did not arrive within 30 s.", ()),
+    "busy": ("16 images wait already: try again in a second.", ()),
+    "not-ready": ("The database cannot be written to.", ()),
+    "internal-error": ("Something went wrong here; the log has it under this X-Request-Id.", ()),
+}
+
+
+def responses(*errors: type[CamindError]) -> dict[int | str, dict[str, Any]]:
+    """What a route passes as ``responses=``: one entry per status, one example per kind of error."""
+    documented: dict[int | str, dict[str, Any]] = {}
+    for error in errors:
+        entry = documented.setdefault(error.status, _empty_entry(error))
+        entry["content"][PROBLEM_TYPE]["examples"][error.code] = {
+            "summary": error.title,
+            "value": _example(error),
+        }
+    return documented
+
+
+def _empty_entry(error: type[CamindError]) -> dict[str, Any]:
+    schema = {"$ref": "#/components/schemas/Problem"}
+    entry: dict[str, Any] = {
+        "description": error.title,
+        "content": {PROBLEM_TYPE: {"schema": schema, "examples": {}}},
+    }
+    if error.status == 503:
+        entry["headers"] = {"Retry-After": {"description": "Seconds to wait", "schema": {"type": "integer"}}}
+    return entry
+
+
+def _example(error: type[CamindError]) -> dict[str, Any]:
+    detail, fields = EXAMPLES.get(error.code, (error.title, ()))
+    shown = Problem(
+        type=TYPE_PREFIX + error.code,
+        title=error.title,
+        status=error.status,
+        detail=detail,
+        errors=[ProblemField(pointer=item.pointer, detail=item.detail) for item in fields] or None,
+    )
+    return shown.model_dump(exclude_none=True)
+
+
+def invalid_request(faults: Sequence[Mapping[str, Any]]) -> BadRequest:
+    """Pydantic's faults as one error; what the client sent is never echoed, only where it went wrong."""
+    fields = tuple(FieldProblem(_pointer(fault), _detail(fault)) for fault in faults)
+    first = fields[0]
+    where = first.pointer.removeprefix("#").strip("/").replace("/", ".")
+    return BadRequest(f"{where}: {first.detail}" if where else first.detail, errors=fields)
+
+
+def _pointer(fault: Mapping[str, Any]) -> str:
+    source, *path = fault["loc"] or ("body",)
+    if fault["type"] == "json_invalid" or (source == "body" and not path):
+        return "#" + str(fault.get("ctx", {}).get("pointer", ""))
+    if source != "body":
+        return ".".join(map(_printable, path)) or str(source)
+    return "#" + "".join(f"/{_printable(part).replace('~', '~0').replace('/', '~1')}" for part in path)
+
+
+def _detail(fault: Mapping[str, Any]) -> str:
+    if fault["type"] == "json_invalid":
+        return f"This is no JSON: {fault['ctx']['error']} at character {fault['loc'][-1]}."
+    if fault["type"] == "extra_forbidden":
+        return _unknown_field(str(fault["loc"][-1]))
+    return _printable(str(fault["msg"]).removeprefix("Value error, "))
+
+
+def _unknown_field(name: str) -> str:
+    if "35" in name:
+        return (
+            "A 35-mm-equivalent focal length is not the lens' focal length, and k_cam grows with its square: "
+            "send the real one as focal_length_mm (it stands on the lens, or as FocalLength in the EXIF data)."
+        )
+    return "There is no such field: remove it, or correct its name."
+
+
+def _printable(part: object) -> str:
+    """Text that is safe in JSON and short: control characters and lone surrogates become question marks."""
+    return re.sub(r"[\x00-\x1f\x7f\ud800-\udfff]", "?", str(part))[:200]

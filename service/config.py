@@ -1,0 +1,149 @@
+"""The settings: one frozen object, read once from ``CAMIND_*`` variables and passed in.
+
+Nothing else reads the environment, and nothing is read at import. A value out of bounds refuses to start.
+"""
+
+import os
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, ValidationError, model_validator
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+ENV_PREFIX = "CAMIND_"
+SHIPPED_MODEL = Path(__file__).parent / "models"
+DATABASE_FILE = "camind.sqlite3"
+DATABASE_SCHEMES = ("sqlite", "postgresql+psycopg")
+
+
+class SettingsError(ValueError):
+    """A setting that cannot be served with; the message names the variable and its bound."""
+
+
+def available_cores() -> int:
+    """Processor cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def default_data_dir() -> Path:
+    """Where the user's data belongs: ``$XDG_DATA_HOME/camind``, by default ``~/.local/share/camind``."""
+    base = os.environ.get("XDG_DATA_HOME") or "~/.local/share"
+    return Path(base).expanduser() / "camind"
+
+
+class Settings(BaseSettings):
+    """Everything an operator can choose. Durations in seconds, sizes in bytes, images in pixels."""
+
+    model_config = SettingsConfigDict(
+        env_prefix=ENV_PREFIX, frozen=True, extra="forbid", env_ignore_empty=True
+    )
+
+    data_dir: Annotated[Path, Field(description="Folder of the database and of the service's files")] = Field(
+        default_factory=default_data_dir
+    )
+    database_url: Annotated[
+        str, Field(description="SQLite or PostgreSQL (postgresql+psycopg://); empty: a file in data_dir")
+    ] = ""
+    model_dir: Annotated[Path, Field(description="Model folder to serve; default: the shipped model")] = (
+        SHIPPED_MODEL
+    )
+
+    host: Annotated[str, Field(min_length=1, description="Address to bind; default: this machine only")] = (
+        "127.0.0.1"
+    )
+    port: Annotated[int, Field(ge=0, le=65535, description="TCP port; 0 lets the system choose")] = 8000
+
+    workers: Annotated[int, Field(ge=0, le=64, description="Images worked on at a time; 0: cores / 2")] = 0
+    intra_op_threads: Annotated[
+        int, Field(ge=0, le=64, description="Threads per image; 0: cores / workers")
+    ] = 0
+    queue_size: Annotated[int, Field(ge=0, le=1000, description="Images that may wait for a worker")] = 16
+    deadline_s: Annotated[float, Field(gt=0, le=600, description="Longest wait and work for one image")] = (
+        30.0
+    )
+
+    max_image_bytes: Annotated[
+        int, Field(ge=1_000, le=1_000_000_000, description="Largest request body with an image")
+    ] = 40_000_000
+    max_image_pixels: Annotated[
+        int, Field(ge=1_000, le=500_000_000, description="Largest image, width x height")
+    ] = 24_000_000
+    max_json_bytes: Annotated[
+        int, Field(ge=1_000, le=10_000_000, description="Largest request body without an image")
+    ] = 64_000
+    receive_deadline_s: Annotated[
+        float, Field(gt=0, le=600, description="Longest time for a request's headers, and for its body")
+    ] = 30.0
+
+    log_level: Annotated[
+        Literal["debug", "info", "warning", "error"], Field(description="Least level logged")
+    ] = "info"
+    log_format: Annotated[
+        Literal["console", "json"], Field(description="One event a line, for people or for machines")
+    ] = "console"
+
+    @model_validator(mode="after")
+    def _check_database(self) -> Self:
+        scheme = self.database_url.partition(":")[0]
+        if self.database_url and scheme not in DATABASE_SCHEMES:
+            raise ValueError(f"{ENV_PREFIX}DATABASE_URL must begin with one of {', '.join(DATABASE_SCHEMES)}")
+        return self
+
+    @model_validator(mode="after")
+    def _check_threads(self) -> Self:
+        cores = available_cores()
+        if self.worker_slots * self.threads_per_worker > cores:
+            raise ValueError(
+                f"{ENV_PREFIX}WORKERS x {ENV_PREFIX}INTRA_OP_THREADS is "
+                f"{self.worker_slots} x {self.threads_per_worker}, more than the {cores} cores: lower one"
+            )
+        return self
+
+    @property
+    def worker_slots(self) -> int:
+        """Images worked on at a time."""
+        return self.workers or max(1, available_cores() // max(2, self.intra_op_threads))
+
+    @property
+    def threads_per_worker(self) -> int:
+        """Threads inside one graph run; times ``worker_slots`` at most the cores, unless one slot asks for more."""
+        return self.intra_op_threads or max(1, available_cores() // self.worker_slots)
+
+    @property
+    def effective_database_url(self) -> str:
+        """The database's URL, the default file in the data folder filled in."""
+        return self.database_url or f"sqlite:///{self.data_dir.expanduser().resolve() / DATABASE_FILE}"
+
+    @property
+    def is_database_embedded(self) -> bool:
+        """Whether the database is ours alone, and ``camind serve`` may migrate it."""
+        return self.effective_database_url.startswith("sqlite")
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether only this machine can reach the service."""
+        try:
+            return ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host == "localhost"
+
+
+def load_settings(**overrides: object) -> Settings:
+    """The settings from the environment, with the command line's ``overrides`` on top (``None``: not given).
+
+    Raises ``SettingsError``, one line per wrong value.
+    """
+    given = {name: value for name, value in overrides.items() if value is not None}
+    try:
+        return Settings(**given)  # type: ignore[arg-type]  # pydantic checks them
+    except ValidationError as exc:
+        raise SettingsError("\n".join(_fault_line(dict(fault)) for fault in exc.errors())) from exc
+
+
+def _fault_line(fault: dict[str, object]) -> str:
+    loc = fault["loc"]
+    message = str(fault["msg"]).removeprefix("Value error, ")
+    if not isinstance(loc, tuple) or not loc:
+        return message
+    return f"{ENV_PREFIX}{str(loc[0]).upper()}={fault['input']}: {message}"

@@ -1,0 +1,234 @@
+"""Cameras in the database: a name, its current revision, and every revision it ever had.
+
+A revision is written once and never changed. A deleted name is free again, and the camera registered next
+under it goes on counting: a name with a revision number means the same numbers for ever.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Literal
+
+from sqlalchemy import Engine
+from sqlalchemy.exc import IntegrityError
+from sqlmodel import Session, col, select
+
+from service.errors import Conflict, NotFound, PreconditionFailed
+from service.optics.camera import Camera, Intrinsics, Lens
+from service.storage.engine import reading, writing
+from service.storage.tables import CameraRevisionRow, CameraRow
+
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
+DEFAULT_K_R = 4.0
+
+Source = Literal["given", "lens", "calibration"]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraDraft:
+    """A camera before it is stored: what depth needs, and what it was made from."""
+
+    name: str
+    camera: Camera
+    source: Source
+    lens: Lens | None = None
+    description: str | None = None
+
+    @property
+    def k_r(self) -> float:
+        """Diameter of the circle of confusion over the standard deviation that k_cam stands for."""
+        return self.lens.k_r if self.lens else DEFAULT_K_R
+
+
+@dataclass(frozen=True, slots=True)
+class CameraRecord:
+    """A stored camera at one revision; times are UTC."""
+
+    draft: CameraDraft
+    revision: int
+    created_at: datetime
+    updated_at: datetime
+
+    @property
+    def name(self) -> str:
+        return self.draft.name
+
+    @property
+    def camera(self) -> Camera:
+        return self.draft.camera
+
+
+class Cameras:
+    """The cameras of one database; safe to share between threads."""
+
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+
+    def add(self, draft: CameraDraft) -> CameraRecord:
+        """Store a new camera. Raises ``Conflict`` where the name is taken."""
+        now = datetime.now(UTC)
+        try:
+            with writing(self._engine) as session:
+                row = _find_row(session, draft.name, lock=True)
+                if row is not None and row.deleted_at is None:
+                    raise _taken(draft.name)
+                row = row or CameraRow(name=draft.name, revision=0, created_at=now, updated_at=now)
+                row.created_at = now
+                row.deleted_at = None
+                return _write_revision(session, row, draft, now)
+        except IntegrityError as exc:
+            # another process was faster between the look and the insert
+            raise _taken(draft.name) from exc
+
+    def get(self, name: str) -> CameraRecord:
+        """The camera at its current revision. Raises ``NotFound``."""
+        with reading(self._engine) as session:
+            return _to_record(*_current(session, name))
+
+    def page(self, limit: int, after: str | None = None) -> tuple[list[CameraRecord], bool]:
+        """Up to ``limit`` cameras by name, from the one behind ``after``; and whether there are more."""
+        query = (
+            select(CameraRow, CameraRevisionRow)
+            .join(CameraRevisionRow, col(CameraRevisionRow.camera_id) == col(CameraRow.id))
+            .where(
+                col(CameraRevisionRow.revision) == col(CameraRow.revision),
+                col(CameraRow.deleted_at).is_(None),
+            )
+            .order_by(col(CameraRow.name))
+            .limit(limit + 1)
+        )
+        if after is not None:
+            query = query.where(col(CameraRow.name) > after)
+        with reading(self._engine) as session:
+            records = [_to_record(row, revision) for row, revision in session.exec(query)]
+        return records[:limit], len(records) > limit
+
+    def replace(self, draft: CameraDraft, expected: Sequence[int] | None = None) -> CameraRecord:
+        """Store a new revision of a camera.
+
+        Raises ``NotFound``, and ``PreconditionFailed`` where its revision is none of those ``expected``.
+        """
+        with writing(self._engine) as session:
+            row = _require_row(session, draft.name, expected)
+            return _write_revision(session, row, draft, datetime.now(UTC))
+
+    def delete(self, name: str, expected: Sequence[int] | None = None) -> None:
+        """Free the name; the revisions stay. Raises as ``replace`` does."""
+        with writing(self._engine) as session:
+            row = _require_row(session, name, expected)
+            row.deleted_at = datetime.now(UTC)
+            session.add(row)
+
+
+def _taken(name: str) -> Conflict:
+    return Conflict(f"A camera '{name}' exists already: replace it with PUT /cameras/{name}.")
+
+
+def _find_row(session: Session, name: str, *, lock: bool = False) -> CameraRow | None:
+    # what is no name is in no table, and PostgreSQL refuses some of it (a NUL) outright
+    if not re.fullmatch(NAME_PATTERN, name):
+        return None
+    query = select(CameraRow).where(col(CameraRow.name) == name)
+    return session.exec(query.with_for_update() if lock else query).first()
+
+
+def _live(row: CameraRow | None, name: str) -> CameraRow:
+    if row is None or row.deleted_at is not None:
+        raise NotFound(f"There is no camera '{name[:64]}': register it with POST /cameras.")
+    return row
+
+
+def _require_row(session: Session, name: str, expected: Sequence[int] | None) -> CameraRow:
+    """The row, locked until the end of the transaction, at one of the expected revisions."""
+    row = _live(_find_row(session, name, lock=True), name)
+    if expected is not None and row.revision not in expected:
+        raise PreconditionFailed(
+            f"Camera '{name}' is at revision {row.revision}: read it again, then repeat."
+        )
+    return row
+
+
+def _current(session: Session, name: str) -> tuple[CameraRow, CameraRevisionRow]:
+    row = _live(_find_row(session, name), name)
+    query = select(CameraRevisionRow).where(
+        col(CameraRevisionRow.camera_id) == row.id, col(CameraRevisionRow.revision) == row.revision
+    )
+    return row, session.exec(query).one()
+
+
+def _write_revision(session: Session, row: CameraRow, draft: CameraDraft, now: datetime) -> CameraRecord:
+    row.revision += 1
+    row.updated_at = now
+    session.add(row)
+    session.flush()
+    if row.id is None:
+        raise RuntimeError("the database gave the camera no id")
+    revision = _to_revision_row(row.id, row.revision, draft, now)
+    session.add(revision)
+    session.flush()
+    return _to_record(row, revision)
+
+
+def _to_revision_row(camera_id: int, number: int, draft: CameraDraft, now: datetime) -> CameraRevisionRow:
+    camera, lens, intrinsics = draft.camera, draft.lens, draft.camera.intrinsics
+    return CameraRevisionRow(
+        camera_id=camera_id,
+        revision=number,
+        created_at=now,
+        description=draft.description,
+        source=draft.source,
+        image_width_px=camera.image_width_px,
+        image_height_px=camera.image_height_px,
+        focus_distance_m=camera.focus_distance_m,
+        k_cam_px=camera.k_cam_px,
+        gamma_px=camera.gamma_px,
+        k_r=draft.k_r,
+        focal_length_mm=lens and lens.focal_length_mm,
+        f_number=lens and lens.f_number,
+        pixel_pitch_um=lens and lens.pixel_pitch_um,
+        sensor_width_px=lens and lens.sensor_width_px,
+        fx_px=intrinsics and intrinsics.fx_px,
+        fy_px=intrinsics and intrinsics.fy_px,
+        cx_px=intrinsics and intrinsics.cx_px,
+        cy_px=intrinsics and intrinsics.cy_px,
+        distortion=list(intrinsics.distortion) if intrinsics else None,
+    )
+
+
+def _to_record(row: CameraRow, revision: CameraRevisionRow) -> CameraRecord:
+    lens = _to_lens(revision)
+    camera = Camera(
+        image_width_px=revision.image_width_px,
+        image_height_px=revision.image_height_px,
+        focus_distance_m=revision.focus_distance_m,
+        k_cam_px=revision.k_cam_px,
+        gamma_px=revision.gamma_px,
+        focal_length_m=lens.focal_length_m if lens else None,
+        intrinsics=_to_intrinsics(revision),
+    )
+    draft = CameraDraft(row.name, camera, _to_source(revision.source), lens, revision.description)
+    return CameraRecord(draft, revision.revision, row.created_at, row.updated_at)
+
+
+def _to_lens(row: CameraRevisionRow) -> Lens | None:
+    if (
+        row.focal_length_mm is None
+        or row.f_number is None
+        or row.pixel_pitch_um is None
+        or row.sensor_width_px is None
+    ):
+        return None
+    return Lens(row.focal_length_mm, row.f_number, row.pixel_pitch_um, row.sensor_width_px, row.k_r)
+
+
+def _to_intrinsics(row: CameraRevisionRow) -> Intrinsics | None:
+    if row.fx_px is None or row.fy_px is None or row.cx_px is None or row.cy_px is None:
+        return None
+    return Intrinsics(row.fx_px, row.fy_px, row.cx_px, row.cy_px, tuple(row.distortion or ()))
+
+
+def _to_source(value: str) -> Source:
+    if value not in ("given", "lens", "calibration"):
+        raise ValueError(f"a stored camera has the unknown source {value!r}")
+    return value

@@ -1,0 +1,86 @@
+"""The database engine: SQLite by default, PostgreSQL by the same URL, both with durable commits."""
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from sqlalchemy import Connection, Engine, create_engine, event, make_url
+from sqlalchemy.exc import DBAPIError, IntegrityError, OperationalError
+from sqlalchemy.pool import ConnectionPoolEntry
+from sqlmodel import Session
+
+from service.errors import Busy, NotReady
+
+BUSY_TIMEOUT_MS = 5_000
+# older ones can corrupt a database when two connections write and checkpoint at the same instant
+FIRST_SAFE_WAL = (3, 51, 3)
+IS_WRITE = "camind_is_write"
+
+
+def open_engine(database_url: str) -> Engine:
+    """An engine for the URL; the folder of an SQLite file is made. Nothing is connected yet."""
+    url = make_url(database_url)
+    if url.get_backend_name() != "sqlite":
+        return create_engine(url, pool_pre_ping=True)
+    if url.database and url.database != ":memory:":
+        Path(url.database).parent.mkdir(parents=True, exist_ok=True)
+    engine = create_engine(url)
+    event.listen(engine, "connect", _prepare_sqlite)
+    event.listen(engine, "begin", _begin_sqlite)
+    return engine
+
+
+def journal_mode(version: tuple[int, ...] = sqlite3.sqlite_version_info) -> str:
+    """Write-ahead log where SQLite's is sound, rollback journal elsewhere."""
+    return "WAL" if version >= FIRST_SAFE_WAL else "DELETE"
+
+
+@contextmanager
+def reading(engine: Engine) -> Iterator[Session]:
+    """A session that only reads. Raises ``Busy`` or ``NotReady`` where the database does not answer."""
+    with _translated(), Session(engine) as session:
+        yield session
+
+
+@contextmanager
+def writing(engine: Engine) -> Iterator[Session]:
+    """A session that writes: the lock is taken at its begin, and it is committed whole or not at all.
+
+    Raises ``Busy`` or ``NotReady`` where the database does not answer; ``IntegrityError`` passes through.
+    """
+    with _translated(), Session(engine.execution_options(**{IS_WRITE: True})) as session, session.begin():
+        yield session
+
+
+def _prepare_sqlite(connection: sqlite3.Connection, _: ConnectionPoolEntry) -> None:
+    connection.isolation_level = None  # the driver would begin too late; _begin_sqlite does it
+    for pragma in (
+        f"busy_timeout = {BUSY_TIMEOUT_MS}",
+        f"journal_mode = {journal_mode()}",
+        "synchronous = FULL",
+        "foreign_keys = ON",
+    ):
+        connection.execute(f"PRAGMA {pragma}").close()
+
+
+def _begin_sqlite(connection: Connection) -> None:
+    # a transaction that reads first and locks later can meet another and deadlock
+    is_write = connection.get_execution_options().get(IS_WRITE, False)
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if is_write else "BEGIN")
+
+
+@contextmanager
+def _translated() -> Iterator[None]:
+    try:
+        yield
+    except IntegrityError:
+        raise
+    except OperationalError as exc:
+        if "locked" in str(exc.orig):
+            raise Busy("The database is busy: try again in a second.") from exc
+        raise NotReady("The database does not answer: look at the service's log.") from exc
+    except DBAPIError as exc:
+        if exc.connection_invalidated:
+            raise NotReady("The database does not answer: look at the service's log.") from exc
+        raise
