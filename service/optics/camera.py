@@ -60,6 +60,26 @@ class Intrinsics:
             self.distortion,
         )
 
+    def turned(self, transposed: bool, flip_u: bool, flip_v: bool, size_px: tuple[int, int]) -> "Intrinsics":
+        """The same camera after its picture was transposed, then flipped along u, then along v.
+
+        ``size_px`` is the width and height after the transposition. Tangential and thin-prism terms turn with
+        the picture; tilt terms (beyond the twelfth) have no turned form and are left out.
+        """
+        fx_px, fy_px, cx_px, cy_px = self.fx_px, self.fy_px, self.cx_px, self.cy_px
+        terms = list(self.distortion[:12])
+        if transposed:
+            fx_px, fy_px, cx_px, cy_px = fy_px, fx_px, cy_px, cx_px
+            terms[2:4] = terms[3:1:-1]
+            terms[8:12] = terms[10:12] + terms[8:10]
+        if flip_u:
+            cx_px = size_px[0] - 1 - cx_px
+            terms = [-term if place in (3, 8, 9) else term for place, term in enumerate(terms)]
+        if flip_v:
+            cy_px = size_px[1] - 1 - cy_px
+            terms = [-term if place in (2, 10, 11) else term for place, term in enumerate(terms)]
+        return Intrinsics(fx_px, fy_px, cx_px, cy_px, tuple(terms))
+
 
 @dataclass(frozen=True, slots=True)
 class Camera:
@@ -116,6 +136,14 @@ class Camera:
             gamma_px=self.gamma_px * ratio,
             intrinsics=scaled,
         )
+
+    def turned(self, transposed: bool, flip_u: bool, flip_v: bool) -> "Camera":
+        """The camera behind the same picture transposed, then flipped along u, then along v; k_cam stays."""
+        size_px = (self.image_width_px, self.image_height_px)
+        if transposed:
+            size_px = (self.image_height_px, self.image_width_px)
+        intrinsics = self.intrinsics and self.intrinsics.turned(transposed, flip_u, flip_v, size_px)
+        return replace(self, image_width_px=size_px[0], image_height_px=size_px[1], intrinsics=intrinsics)
 
     def focused_at(self, focus_distance_m: float) -> "Camera":
         """The same camera focused elsewhere; without a known focal length f << s1 is assumed.

@@ -34,15 +34,22 @@ LOG_DEPTH_SCALE = 0.02
 STRIDE = 2
 MULTIPLE = 16
 OPSET = 17
+BLUR_RANGE = Interval(0.3, 20.0)
 
 
-def build_oracle_pair(folder: Path, stride: int = STRIDE) -> Path:
+def build_oracle_pair(
+    folder: Path,
+    stride: int = STRIDE,
+    *,
+    depth_scale: float = LOG_DEPTH_SCALE,
+    blur_range: Interval = BLUR_RANGE,
+) -> Path:
     """Write blur.onnx, depth.onnx, MODEL_CARD.md and manifest.json into the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     onnx.save(_blur_graph(stride), folder / "blur.onnx")
-    onnx.save(_depth_graph(), folder / "depth.onnx")
+    onnx.save(_depth_graph(depth_scale), folder / "depth.onnx")
     (folder / "MODEL_CARD.md").write_text("# Oracle\n\nBrightness is blur. For tests.\n", encoding="utf-8")
-    write_manifest(folder, _manifest(folder, stride))
+    write_manifest(folder, _manifest(folder, stride, blur_range))
     return folder
 
 
@@ -56,7 +63,7 @@ def blur_of(brightness: int) -> float:
     return brightness / 255 * WHITE_BLUR_PX
 
 
-def _manifest(folder: Path, stride: int) -> Manifest:
+def _manifest(folder: Path, stride: int, blur_range: Interval) -> Manifest:
     return Manifest(
         name="oracle-20260101",
         kind="compact",
@@ -65,7 +72,7 @@ def _manifest(folder: Path, stride: int) -> Manifest:
         stride=stride,
         graphs=Graphs(blur=_graph_file(folder / "blur.onnx"), depth=_graph_file(folder / "depth.onnx")),
         ranges=Ranges(
-            blur_px=Interval(0.3, 20),
+            blur_px=blur_range,
             k_cam_px=Interval(0.5, 12),
             focus_distance_m=Interval(0.5, 5),
             focal_length_px=Interval(200, 6000),
@@ -129,7 +136,7 @@ def _blur_graph(stride: int) -> onnx.ModelProto:
     return _model("blur", nodes, [_value("image", "n", 3, "h", "w")], outputs, constants)
 
 
-def _depth_graph() -> onnx.ModelProto:
+def _depth_graph(depth_scale: float) -> onnx.ModelProto:
     maps = ("relative_defocus", "relative_defocus_spread", "features_red")
     numbers = ("focus_distance_m", "focal_length_px", "side")
     nodes = [
@@ -148,7 +155,7 @@ def _depth_graph() -> onnx.ModelProto:
         _constant("one", np.ones(1)),
         _constant("almost_one", np.full(1, 0.999)),
         _constant("zero", np.zeros(1)),
-        _constant("log_scale_value", np.log(np.full(1, LOG_DEPTH_SCALE))),
+        _constant("log_scale_value", np.log(np.full(1, depth_scale))),
     ]
     inputs = [_value(name, "n", 1, "h", "w") for name in maps] + [_value(name, "n") for name in numbers]
     names = ("log_ratio_near", "log_ratio_far", "p_near", "log_scale")

@@ -1,0 +1,147 @@
+"""The answer to one photograph, and how raw maps become it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.inference.pair import MAPS, RawMaps, Side
+from service.inference.resampling import Axis, sample
+from service.optics import thin_lens
+from service.optics.camera import Camera
+
+MAX_RELATIVE_ERROR = 0.5
+SIGMA_OF_LAPLACE = np.float32(2**0.5)
+ROWS_AT_ONCE = 128
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class DepthMap:
+    """Maps [height, width] of the upright photograph, in metres along the optical axis if not said otherwise.
+
+    ``depth_m`` and ``sigma_m`` are NaN where there is no answer (``valid`` is false), ``depth_alt_m`` there
+    and where no other hypothesis exists. ``p_near`` is 0..1; ``blur_px`` is in pixels of the photograph.
+    ``camera`` is the one used, at the photograph's size; ``scales`` are the copies read, 1 being full size.
+    """
+
+    depth_m: Array
+    depth_alt_m: Array
+    p_near: Array
+    sigma_m: Array
+    blur_px: Array
+    valid: NDArray[np.bool_]
+    camera: Camera
+    scales: tuple[float, ...]
+    warnings: tuple[str, ...]
+    timings_ms: Mapping[str, float]
+
+    @property
+    def width_px(self) -> int:
+        return int(self.depth_m.shape[1])
+
+    @property
+    def height_px(self) -> int:
+        return int(self.depth_m.shape[0])
+
+    @property
+    def valid_fraction(self) -> float:
+        return float(self.valid.mean())
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """Raw maps of one copy of the photograph, with the camera at that copy's size."""
+
+    maps: RawMaps
+    camera: Camera
+    scale: float
+    rows: Axis
+    columns: Axis
+
+    @classmethod
+    def of(cls, maps: RawMaps, camera: Camera, photograph_size: tuple[int, int], stride: int) -> Self:
+        """``photograph_size`` is (height, width)."""
+        height, width = photograph_size
+        map_rows, map_columns = maps["blur_px"].shape
+        return cls(
+            maps,
+            camera,
+            camera.image_width_px / width,
+            Axis.between(height, camera.image_height_px, stride, map_rows),
+            Axis.between(width, camera.image_width_px, stride, map_columns),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Layers:
+    """The float maps of a photograph, or of some of its rows."""
+
+    depth_m: Array
+    depth_alt_m: Array
+    p_near: Array
+    sigma_m: Array
+    blur_px: Array
+
+    @classmethod
+    def empty(cls, height: int, width: int) -> Self:
+        return cls(*(np.empty((height, width), np.float32) for _ in cls.__slots__))
+
+    def put(self, start: int, stop: int, other: "Layers", where: NDArray[np.bool_] | None = None) -> None:
+        """Copy rows ``start:stop`` from layers of that height, everywhere or where told."""
+        for name in self.__slots__:
+            np.copyto(
+                getattr(self, name)[start:stop],
+                getattr(other, name),
+                where=True if where is None else where,
+            )
+
+
+def decide(readings: list[Reading], size: tuple[int, int], side: Side) -> tuple[Layers, NDArray[np.bool_]]:
+    """Layers (height, width) and which pixels have an answer; the surest reading wins, pixel by pixel.
+
+    Rows are done in bands: a photograph of 12 megapixels would need a gigabyte at once.
+    """
+    height, width = size
+    layers = Layers.empty(height, width)
+    for start in range(0, height, ROWS_AT_ONCE):
+        stop = min(start + ROWS_AT_ONCE, height)
+        best: Array | None = None
+        for reading in readings:
+            band, error = _band(reading, start, stop, side)
+            where = None if best is None else error < best
+            layers.put(start, stop, band, where)
+            best = error if best is None else np.fmin(best, error)
+    with np.errstate(invalid="ignore"):
+        valid = (layers.sigma_m <= MAX_RELATIVE_ERROR * layers.depth_m) & np.isfinite(layers.depth_m)
+    for hidden in (layers.depth_m, layers.depth_alt_m, layers.sigma_m):
+        hidden[~valid] = np.nan
+    return layers, valid
+
+
+def _band(reading: Reading, start: int, stop: int, side: Side) -> tuple[Layers, Array]:
+    """Layers of some rows from one reading, and the relative error of depth there."""
+    rows = reading.rows.part(start, stop)
+    at = {name: sample(reading.maps[name], rows, reading.columns) for name in MAPS}
+    camera = reading.camera
+    x = thin_lens.relative_defocus_from_blur(at["blur_px"], camera.gamma_px, camera.k_cam_px)
+    has_far = x < 1
+    near_m = np.exp(at["log_ratio_near"]) * camera.focus_distance_m
+    far_m = np.where(has_far, np.exp(at["log_ratio_far"]) * camera.focus_distance_m, np.float32(np.nan))
+    p_near = _p_near(at["p_near"], has_far, side)
+    is_near = p_near >= 0.5
+    depth_m = np.where(is_near, near_m, far_m)
+    error = np.exp(at["log_scale"]) * SIGMA_OF_LAPLACE
+    blur_px = at["blur_px"] / np.float32(reading.scale)
+    return Layers(depth_m, np.where(is_near, far_m, near_m), p_near, error * depth_m, blur_px), error
+
+
+def _p_near(told: Array, has_far: NDArray[np.bool_], side: Side) -> Array:
+    """What the network tells unless the side is given; where no far answer can exist it is near, always."""
+    if side == "near":
+        return np.ones_like(told)
+    asked = np.zeros_like(told) if side == "far" else np.clip(told, 0, 1)
+    return np.where(has_far, asked, np.float32(1))

@@ -1,0 +1,194 @@
+"""A DepthMap as bytes: PNG16, NPY, NPZ, TIFF, PLY and a preview; and its numbers for JSON.
+
+Units and the sign for no answer are those of ROS REP 118: float metres with NaN, or millimetres with 0.
+"""
+
+import io
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+
+from service.errors import BadRequest
+from service.inference.depth_map import DepthMap
+from service.inference.preview import render_preview
+from service.opencv import cv2
+
+MILLIMETRE = 0.001
+LARGEST_MILLIMETRES = 65535
+PERCENTILES = (0, 5, 50, 95, 100)
+
+
+@dataclass(frozen=True, slots=True)
+class Encoded:
+    """A body with its media type, the metres per unit in it, and what was lost."""
+
+    body: bytes
+    media_type: str
+    depth_scale_m: float = 1.0
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class PointReading:
+    """Depth at one pixel; None is no answer."""
+
+    u: float
+    v: float
+    depth_m: float | None
+    depth_alt_m: float | None
+    sigma_m: float | None
+    p_near: float
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """Depth over all pixels with an answer, in metres; None without one."""
+
+    min: float | None
+    p5: float | None
+    median: float | None
+    p95: float | None
+    max: float | None
+
+
+def encode_png(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
+    """16-bit grey, millimetres along z; 0 is no answer, which includes what lies beyond 65.535 m."""
+    millimetres = np.rint(np.nan_to_num(answer.depth_m, nan=0.0, posinf=0.0) / MILLIMETRE)
+    beyond = millimetres > LARGEST_MILLIMETRES
+    millimetres[beyond] = 0
+    body = _written(
+        ".png",
+        millimetres.astype(np.uint16),
+        (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP),
+    )
+    lost = f"{beyond.mean():.1%} of the pixels lie beyond the 65.535 m a 16-bit PNG can hold and read 0"
+    return Encoded(body, "image/png", MILLIMETRE, (lost,) if beyond.any() else ())
+
+
+def encode_npy(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
+    """float32 metres [height, width], NaN where there is no answer."""
+    stream = io.BytesIO()
+    np.save(stream, answer.depth_m, allow_pickle=False)
+    return Encoded(stream.getvalue(), "application/x-npy")
+
+
+def encode_npz(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
+    """All maps by their names, and ``K`` float64 [3, 3], NaN where the intrinsics are unknown."""
+    stream = io.BytesIO()
+    np.savez(
+        stream,
+        depth_m=answer.depth_m,
+        depth_alt_m=answer.depth_alt_m,
+        p_near=answer.p_near,
+        sigma_m=answer.sigma_m,
+        blur_px=answer.blur_px,
+        valid=answer.valid,
+        K=camera_matrix(answer),
+    )
+    return Encoded(stream.getvalue(), "application/x-npz")
+
+
+def encode_tiff(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
+    """float32 metres, one page, uncompressed; NaN where there is no answer."""
+    stream = io.BytesIO()
+    tifffile.imwrite(stream, answer.depth_m, photometric="minisblack")
+    return Encoded(stream.getvalue(), "image/tiff")
+
+
+def encode_ply(answer: DepthMap, rgb: NDArray[np.uint8]) -> Encoded:
+    """Binary little-endian points in metres (x right, y down, z forward) with the photograph's colours.
+
+    Raises ``BadRequest`` without intrinsics: no focal length, no points.
+    """
+    matrix = camera_matrix(answer)
+    if not np.isfinite(matrix).all():
+        raise BadRequest("points need the camera's intrinsics: register fx_px, fy_px, cx_px and cy_px")
+    v, u = np.nonzero(answer.valid)
+    z = answer.depth_m[v, u]
+    points = np.empty(
+        len(z), [(axis, "<f4") for axis in "xyz"] + [(colour, "u1") for colour in ("red", "green", "blue")]
+    )
+    points["x"] = (u - matrix[0, 2]) / matrix[0, 0] * z
+    points["y"] = (v - matrix[1, 2]) / matrix[1, 1] * z
+    points["z"] = z
+    points["red"], points["green"], points["blue"] = rgb[v, u].T
+    return Encoded(_ply_header(len(z)) + points.tobytes(), "application/x-ply")
+
+
+def encode_preview(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
+    """JPEG in turbo colours, near red and far blue, grey without an answer, with a legend in metres."""
+    pixels = render_preview(answer.depth_m)
+    body = _written(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), (cv2.IMWRITE_JPEG_QUALITY, 90))
+    return Encoded(body, "image/jpeg")
+
+
+ENCODERS: dict[str, Callable[[DepthMap, NDArray[np.uint8]], Encoded]] = {
+    "png": encode_png,
+    "npy": encode_npy,
+    "npz": encode_npz,
+    "tiff": encode_tiff,
+    "ply": encode_ply,
+    "preview": encode_preview,
+}
+
+
+def camera_matrix(answer: DepthMap) -> NDArray[np.float64]:
+    """K [3, 3] at the photograph's size; NaN for the four numbers of unknown intrinsics."""
+    known = answer.camera.intrinsics
+    fx, fy, cx, cy = (known.fx_px, known.fy_px, known.cx_px, known.cy_px) if known else (math.nan,) * 4
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
+
+
+def spread_of(answer: DepthMap) -> Spread:
+    """Least, 5 %, median, 95 % and greatest depth of the pixels with an answer."""
+    known = answer.depth_m[answer.valid]
+    if known.size == 0:
+        return Spread(None, None, None, None, None)
+    return Spread(*(float(value) for value in np.percentile(known, PERCENTILES)))
+
+
+def read_point(answer: DepthMap, u: float, v: float) -> PointReading:
+    """The maps at the pixel whose area holds (u, v).
+
+    Raises ``IndexError`` outside [-0.5, width - 0.5) x [-0.5, height - 0.5).
+    """
+    row, column = math.floor(v + 0.5), math.floor(u + 0.5)
+    if not (0 <= row < answer.height_px and 0 <= column < answer.width_px):
+        raise IndexError(
+            f"({u:g}, {v:g}) lies outside a photograph of {answer.width_px}x{answer.height_px} pixels"
+        )
+    return PointReading(
+        u,
+        v,
+        _number_or_none(answer.depth_m[row, column]),
+        _number_or_none(answer.depth_alt_m[row, column]),
+        _number_or_none(answer.sigma_m[row, column]),
+        float(answer.p_near[row, column]),
+    )
+
+
+def _number_or_none(value: np.float32) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _written(kind: str, pixels: NDArray[np.integer], options: tuple[int, ...]) -> bytes:
+    is_written, body = cv2.imencode(kind, pixels, options)
+    if not is_written:
+        raise RuntimeError(f"OpenCV cannot write {kind}")
+    return body.tobytes()
+
+
+def _ply_header(count: int) -> bytes:
+    fields = [f"property float {axis}" for axis in "xyz"]
+    fields += [f"property uchar {colour}" for colour in ("red", "green", "blue")]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment metres, x right, y down, z forward",
+        f"element vertex {count}",
+    ]
+    return "\n".join([*lines, *fields, "end_header", ""]).encode("ascii")

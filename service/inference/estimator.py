@@ -1,0 +1,143 @@
+"""A photograph and its camera to depth: chooses the scale, reads, decides. Pure and stateless."""
+
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.inference.artifact import Interval, Manifest, ModelFolder
+from service.inference.cancellation import Cancellation
+from service.inference.depth_map import DepthMap, Layers, Reading, decide
+from service.inference.pair import GraphPair, Side, Stopwatch
+from service.inference.tiles import PIXEL_BUDGET, read_in_tiles
+from service.opencv import cv2
+from service.optics.camera import Camera
+
+HIGH_BLUR = 0.8
+HIGH_BLUR_FRACTION = 0.02
+SECOND_SCALE = 1 / 3
+LEAST_CHANGE_OF_SCALE = 0.7
+FEW_ANSWERS = 0.5
+WARM_UP_PX = 64
+
+
+class Estimator:
+    """Made once from a model folder; ``estimate`` may be called from several threads at once."""
+
+    def __init__(self, pair: GraphPair, pixel_budget: int = PIXEL_BUDGET) -> None:
+        self._pair = pair
+        self._pixel_budget = pixel_budget
+
+    @classmethod
+    def from_folder(cls, folder: ModelFolder, *, intra_op_threads: int = 1) -> Self:
+        """Load both graphs; raises ``ModelFolderError`` where they are not what the manifest says."""
+        return cls(GraphPair(folder, intra_op_threads))
+
+    @property
+    def manifest(self) -> Manifest:
+        return self._pair.manifest
+
+    def warm_up(self) -> None:
+        """Answer one small grey picture, so that the first request does not pay for preparing the graphs."""
+        grey = np.full((WARM_UP_PX, WARM_UP_PX, 3), 128, np.uint8)
+        middle = float(np.mean(self.manifest.ranges.focus_distance_m))
+        self.estimate(grey, Camera(WARM_UP_PX, WARM_UP_PX, middle, self.manifest.ranges.k_cam_px.high))
+
+    def estimate(
+        self,
+        rgb: NDArray[np.uint8],
+        camera: Camera,
+        side: Side = "auto",
+        cancellation: Cancellation | None = None,
+    ) -> DepthMap:
+        """Depth of an upright photograph, uint8 [h, w, 3] sRGB, whose camera is at exactly that size.
+
+        Raises ``ValueError`` for a camera of another size and ``Cancelled`` when asked to stop.
+        """
+        height, width = rgb.shape[:2]
+        if (width, height) != (camera.image_width_px, camera.image_height_px):
+            raise ValueError(f"the camera must be that of a {width}x{height} image: resize it first")
+        cancellation = cancellation or Cancellation()
+        stopwatch = Stopwatch()
+        readings = [self._read(rgb, camera, self._base_scale(camera), side, cancellation, stopwatch)]
+        second = self._second_scale(readings[0])
+        if second is not None:
+            readings.append(self._read(rgb, camera, second, side, cancellation, stopwatch))
+        cancellation.check()
+        with stopwatch.stage("depth"):
+            layers, valid = decide(readings, (height, width), side)
+        return DepthMap(
+            **{name: getattr(layers, name) for name in Layers.__slots__},
+            valid=valid,
+            camera=camera,
+            scales=tuple(reading.scale for reading in readings),
+            warnings=(*self._warnings(readings), *_sparseness(valid)),
+            timings_ms=stopwatch.elapsed_ms,
+        )
+
+    def _base_scale(self, camera: Camera) -> float:
+        """The largest copy whose k_cam the model was trained on; never an enlarged one."""
+        return min(1.0, self.manifest.ranges.k_cam_px.high / camera.k_cam_px)
+
+    def _second_scale(self, first: Reading) -> float | None:
+        """A smaller copy, where the first shows more blur than the model reads well; None without need."""
+        ranges = self.manifest.ranges
+        if (first.maps["blur_px"] > HIGH_BLUR * ranges.blur_px.high).mean() <= HIGH_BLUR_FRACTION:
+            return None
+        change = max(SECOND_SCALE, ranges.k_cam_px.low / first.camera.k_cam_px)
+        return first.scale * change if change <= LEAST_CHANGE_OF_SCALE else None
+
+    def _read(
+        self,
+        rgb: NDArray[np.uint8],
+        camera: Camera,
+        scale: float,
+        side: Side,
+        cancellation: Cancellation,
+        stopwatch: Stopwatch,
+    ) -> Reading:
+        working = camera.resized(
+            max(1, round(camera.image_width_px * scale)), max(1, round(camera.image_height_px * scale))
+        )
+        size = (working.image_width_px, working.image_height_px)
+        copy = rgb if working is camera else cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+        maps = read_in_tiles(
+            np.asarray(copy, np.uint8),
+            lambda tile: self._pair.read(tile, working, side, cancellation, stopwatch),
+            multiple=self.manifest.multiple,
+            stride=self.manifest.stride,
+            pixel_budget=self._pixel_budget,
+        )
+        return Reading.of(maps, working, rgb.shape[:2], self.manifest.stride)
+
+    def _warnings(self, readings: list[Reading]) -> list[str]:
+        first, last, ranges = readings[0], readings[-1], self.manifest.ranges
+        told = [
+            f"read at {reading.scale:.3g} of full size "
+            f"({reading.camera.image_width_px}x{reading.camera.image_height_px})"
+            for reading in readings
+            if reading.scale != 1
+        ]
+        told += _outside("k_cam_px at that size", first.camera.k_cam_px, ranges.k_cam_px)
+        told += _outside("gamma_px at that size", first.camera.gamma_px, ranges.gamma_px)
+        told += _outside("focus_distance_m", first.camera.focus_distance_m, ranges.focus_distance_m)
+        if first.camera.intrinsics:
+            told += _outside("fx_px at that size", first.camera.intrinsics.fx_px, ranges.focal_length_px)
+        blurrier = float((last.maps["blur_px"] > ranges.blur_px.high).mean())
+        if blurrier > HIGH_BLUR_FRACTION:
+            told.append(f"{blurrier:.0%} of the pixels show more blur than the model was trained on")
+        return told
+
+
+def _outside(name: str, value: float, trained: Interval) -> list[str]:
+    # a copy's size is a whole number of pixels, so its constants may miss the range by a rounding
+    if trained.low * 0.99 <= value <= trained.high * 1.01:
+        return []
+    return [
+        f"{name} is {value:.4g}, outside {trained.low:g} to {trained.high:g} that the model was trained on"
+    ]
+
+
+def _sparseness(valid: NDArray[np.bool_]) -> list[str]:
+    fraction = float(valid.mean())
+    return [f"only {fraction:.0%} of the pixels have an answer"] if fraction < FEW_ANSWERS else []

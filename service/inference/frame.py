@@ -1,0 +1,30 @@
+"""Whether a photograph is a camera's frame, and the camera as that photograph has it."""
+
+from service.errors import ImageSizeMismatch
+from service.inference.images import TURNS, Photograph
+from service.optics.camera import Camera
+
+
+def camera_of(photograph: Photograph, camera: Camera) -> tuple[Camera, tuple[str, ...]]:
+    """The camera turned and resized like the upright photograph, with warnings.
+
+    A camera is registered with the size of its files or with that of its upright pictures. Raises
+    ``ImageSizeMismatch`` for a picture that is not the whole frame.
+    """
+    width_px, height_px = photograph.width_px, photograph.height_px
+    turned = camera.turned(*TURNS[photograph.orientation])
+    fitting = next((one for one in (turned, camera) if one.is_same_frame(width_px, height_px)), None)
+    if fitting is None:
+        raise ImageSizeMismatch(
+            f"the photograph has {width_px}x{height_px} pixels upright, the camera "
+            f"{camera.image_width_px}x{camera.image_height_px}: send the whole frame, at any size, not a crop"
+        )
+    resized = fitting.resized(width_px, height_px)
+    if resized is fitting:
+        return fitting, ()
+    warning = (
+        f"the photograph has {width_px}x{height_px} pixels and the camera "
+        f"{fitting.image_width_px}x{fitting.image_height_px}: "
+        f"k_cam_px {resized.k_cam_px:.4g} and gamma_px {resized.gamma_px:.4g} were scaled to it"
+    )
+    return resized, (warning,)

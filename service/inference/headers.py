@@ -1,0 +1,235 @@
+"""What an image file says of itself, without decoding a pixel: kind, size, orientation, and whether it ends.
+
+Each parser walks the file's structure once and believes no length that leads out of the bytes at hand.
+All raise ``InvalidImage`` for a file that is cut off or not of the form its kind prescribes.
+"""
+
+import re
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+from service.errors import InvalidImage, UnsupportedKind
+
+Kind = Literal["jpeg", "png", "tiff", "webp", "heic"]
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+EXIF_SIGNATURE = b"Exif\x00\x00"
+HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"mif1"})
+JPEG_MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
+JPEG_END, JPEG_SCAN, JPEG_APP1 = 0xD9, 0xDA, 0xE1
+JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+JPEG_BARE = frozenset({0x01, 0xD8, *range(0xD0, 0xD8)})
+TIFF_WIDTH, TIFF_HEIGHT, TIFF_ORIENTATION, TIFF_SAMPLE_FORMAT = 256, 257, 274, 339
+TIFF_STORES = ((273, 279), (324, 325))
+TIFF_TYPES = {1: "B", 3: "H", 4: "I"}
+TIFF_MAX_VALUES = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """Stored size in pixels, before orientation (EXIF, 1..8) is applied."""
+
+    kind: Kind
+    width_px: int
+    height_px: int
+    orientation: int = 1
+    orientation_offset: int | None = None
+
+
+def sniff(data: bytes) -> Kind | None:
+    """The kind by its magic bytes, or None for one that is not listed."""
+    if data.startswith(b"\xff\xd8\xff"):
+        return "jpeg"
+    if data.startswith(PNG_SIGNATURE):
+        return "png"
+    if data[:4] in (b"II*\x00", b"MM\x00*"):
+        return "tiff"
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        return "webp"
+    if data[4:8] == b"ftyp" and data[8:12] in HEIC_BRANDS:
+        return "heic"
+    return None
+
+
+def read_header(data: bytes) -> Header:
+    """The header of a JPEG, PNG, TIFF or WebP; ``UnsupportedKind`` for anything else."""
+    kind = sniff(data)
+    parser = PARSERS.get(kind or "")
+    if parser is None:
+        raise UnsupportedKind("the bytes are none of JPEG, PNG, TIFF and WebP")
+    try:
+        header = parser(data)
+    except (struct.error, IndexError) as exc:
+        raise cut_off(str(kind)) from exc
+    if header.width_px < 1 or header.height_px < 1:
+        raise InvalidImage(
+            f"the {header.kind} file states a size of {header.width_px}x{header.height_px} pixels"
+        )
+    return header
+
+
+def cut_off(kind: str) -> InvalidImage:
+    """The error for a file that ends early."""
+    return InvalidImage(f"the {kind} file is cut off: it ends before the picture does")
+
+
+def _jpeg(data: bytes) -> Header:
+    size: tuple[int, int] | None = None
+    orientation = 1
+    for marker, payload in _jpeg_segments(data):
+        if marker in JPEG_FRAMES and size is None:
+            height, width = struct.unpack_from(">HH", payload, 1)
+            size = (width, height)
+        elif marker == JPEG_APP1 and payload.startswith(EXIF_SIGNATURE):
+            orientation = _exif_orientation(payload[len(EXIF_SIGNATURE) :])
+    if size is None:
+        raise InvalidImage("the jpeg file holds no picture")
+    return Header("jpeg", *size, orientation)
+
+
+def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Every marker with its payload up to the end marker, which a whole file has after its last scan."""
+    at = 2
+    while True:
+        while data[at] == 0xFF and data[at + 1] == 0xFF:
+            at += 1
+        if data[at] != 0xFF:
+            raise InvalidImage("the jpeg file is damaged: no marker where one must be")
+        marker, at = data[at + 1], at + 2
+        if marker == JPEG_END:
+            return
+        if marker in JPEG_BARE:
+            continue
+        (length,) = struct.unpack_from(">H", data, at)
+        yield marker, data[at + 2 : at + length]
+        at += length
+        if marker == JPEG_SCAN:
+            found = JPEG_MARKER_IN_SCAN.search(data, at)
+            if found is None:
+                raise cut_off("jpeg")
+            at = found.start()
+
+
+def _png(data: bytes) -> Header:
+    size = (0, 0)
+    orientation = 1
+    for name, payload in _png_chunks(data):
+        if name == b"IHDR":
+            size = struct.unpack_from(">II", payload)
+        elif name == b"eXIf":
+            orientation = _exif_orientation(payload)
+    return Header("png", *size, orientation)
+
+
+def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Every chunk up to the last, each with the checksum it states."""
+    at = len(PNG_SIGNATURE)
+    name = b""
+    while name != b"IEND":
+        length, name = struct.unpack_from(">I4s", data, at)
+        end = at + 8 + length
+        (checksum,) = struct.unpack_from(">I", data, end)
+        if zlib.crc32(memoryview(data)[at + 4 : end]) != checksum:
+            raise InvalidImage(
+                f"the png file is damaged: its {name.decode('latin-1')!r} part fails its checksum"
+            )
+        yield name, data[at + 8 : end] if name in (b"IHDR", b"eXIf") else b""
+        at = end + 4
+
+
+def _webp(data: bytes) -> Header:
+    (length,) = struct.unpack_from("<I", data, 4)
+    if length + 8 > len(data):
+        raise cut_off("webp")
+    size: tuple[int, int] | None = None
+    orientation = 1
+    at = 12
+    while at + 8 <= length + 8:
+        name, chunk = struct.unpack_from("<4sI", data, at)
+        size = size or _webp_size(name, data[at + 8 : at + 18])
+        if name == b"EXIF":
+            orientation = _exif_orientation(data[at + 8 : at + 8 + chunk].removeprefix(EXIF_SIGNATURE))
+        at += 8 + chunk + chunk % 2
+    if size is None:
+        raise InvalidImage("the webp file holds no picture")
+    return Header("webp", *size, orientation)
+
+
+def _webp_size(name: bytes, payload: bytes) -> tuple[int, int] | None:
+    if name == b"VP8X":
+        return 1 + int.from_bytes(payload[4:7], "little"), 1 + int.from_bytes(payload[7:10], "little")
+    if name == b"VP8L":
+        bits = int.from_bytes(payload[1:5], "little")
+        return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
+    if name == b"VP8 ":
+        width, height = struct.unpack_from("<HH", payload, 6)
+        return width & 0x3FFF, height & 0x3FFF
+    return None
+
+
+def _tiff(data: bytes) -> Header:
+    directory = _TiffDirectory(data)
+    for offsets, counts in TIFF_STORES:
+        stored = zip(directory.values(offsets), directory.values(counts), strict=False)
+        if any(offset + count > len(data) for offset, count in stored):
+            raise cut_off("tiff")
+    if 3 in directory.values(TIFF_SAMPLE_FORMAT):
+        raise UnsupportedKind("a tiff of floating-point numbers is no photograph: send 8 or 16 bits, sRGB")
+    width, height = (next(iter(directory.values(tag)), 0) for tag in (TIFF_WIDTH, TIFF_HEIGHT))
+    at = directory.offset_of(TIFF_ORIENTATION)
+    return Header("tiff", width, height, directory.orientation(), at)
+
+
+def _exif_orientation(data: bytes) -> int:
+    """Orientation 1..8 from an EXIF block; a block that cannot be read says nothing, which is 1."""
+    try:
+        return _TiffDirectory(data).orientation()
+    except (struct.error, InvalidImage):
+        return 1
+
+
+class _TiffDirectory:
+    """The first directory of a TIFF structure, the form of EXIF too."""
+
+    def __init__(self, data: bytes) -> None:
+        if data[:4] not in (b"II*\x00", b"MM\x00*"):
+            raise InvalidImage("the file has no TIFF header")
+        self._data = data
+        self._order = "<" if data[:2] == b"II" else ">"
+        (start,) = self._unpack("I", 4)
+        (count,) = self._unpack("H", start)
+        self._entries = {self._unpack("H", at)[0]: at for at in range(start + 2, start + 2 + 12 * count, 12)}
+
+    def _unpack(self, form: str, at: int) -> tuple[int, ...]:
+        return struct.unpack_from(self._order + form, self._data, at)
+
+    def offset_of(self, tag: int) -> int | None:
+        """Where a tag's first value stands in the file, or None without the tag."""
+        entry = self._entries.get(tag)
+        if entry is None:
+            return None
+        kind, count = self._unpack("HI", entry + 2)
+        size = struct.calcsize("=" + TIFF_TYPES.get(kind, "I")) * count
+        return entry + 8 if size <= 4 else self._unpack("I", entry + 8)[0]
+
+    def values(self, tag: int) -> tuple[int, ...]:
+        """A tag's whole numbers; empty without the tag or for another type."""
+        at = self.offset_of(tag)
+        if at is None:
+            return ()
+        kind, count = self._unpack("HI", self._entries[tag] + 2)
+        if kind not in TIFF_TYPES:
+            return ()
+        if count > TIFF_MAX_VALUES:
+            raise InvalidImage(f"the tiff file states {count} values for tag {tag}")
+        return self._unpack(f"{count}{TIFF_TYPES[kind]}", at)
+
+    def orientation(self) -> int:
+        value = next(iter(self.values(TIFF_ORIENTATION)), 1)
+        return value if 1 <= value <= 8 else 1
+
+
+PARSERS: dict[str, Callable[[bytes], Header]] = {"jpeg": _jpeg, "png": _png, "tiff": _tiff, "webp": _webp}

@@ -1,0 +1,162 @@
+"""The only door for photographs: bytes in, upright RGB out.
+
+Kind, size and wholeness are decided on the header, before anything is decoded. EXIF orientation is applied
+here and nowhere else.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import InvalidImage, TooLarge, UnsupportedKind
+from service.inference.headers import Header, Kind, read_header, sniff
+from service.opencv import PIXEL_CEILING, cv2
+
+MEDIA_TYPES: dict[str, Kind] = {
+    "image/jpeg": "jpeg",
+    "image/png": "png",
+    "image/tiff": "tiff",
+    "image/webp": "webp",
+    "image/heic": "heic",
+    "image/heif": "heic",
+}
+UNDECLARED = frozenset({"", "application/octet-stream", "image/*"})
+
+# (transposed, flipped left-right, flipped top-bottom), in this order, by EXIF orientation
+TURNS: dict[int, tuple[bool, bool, bool]] = {
+    1: (False, False, False),
+    2: (False, True, False),
+    3: (False, True, True),
+    4: (False, False, True),
+    5: (True, False, False),
+    6: (True, True, False),
+    7: (True, True, True),
+    8: (True, False, True),
+}
+DECODE_FLAGS = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+
+
+@dataclass(frozen=True, slots=True)
+class ImageLimits:
+    """The most that is accepted, in bytes of the file and in pixels of the picture."""
+
+    max_bytes: int = 32 * 2**20
+    max_pixels: int = 64_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Photograph:
+    """``rgb``: uint8 [height, width, 3], sRGB, upright. The stored size is that before orientation."""
+
+    rgb: NDArray[np.uint8]
+    kind: Kind
+    orientation: int
+    stored_width_px: int
+    stored_height_px: int
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def width_px(self) -> int:
+        return int(self.rgb.shape[1])
+
+    @property
+    def height_px(self) -> int:
+        return int(self.rgb.shape[0])
+
+
+def read_photograph(
+    data: bytes, media_type: str | None = None, limits: ImageLimits | None = None
+) -> Photograph:
+    """Decode a photograph; the bytes decide its kind, whatever ``media_type`` declares.
+
+    Raises ``InvalidImage`` (empty, cut off, damaged), ``TooLarge`` (before decoding) and ``UnsupportedKind``
+    (a declared type or bytes that are not listed).
+    """
+    limits = limits or ImageLimits()
+    declared = _declared_kind(media_type)
+    if not data:
+        raise InvalidImage("the body is empty: send the bytes of one photograph")
+    if len(data) > limits.max_bytes:
+        raise TooLarge(f"the file has {len(data)} bytes, more than the {limits.max_bytes} accepted")
+    kind = sniff(data)
+    if kind is None:
+        raise UnsupportedKind("the bytes are none of JPEG, PNG, TIFF, WebP and HEIC")
+    stored, orientation = _decode_heic(data, limits) if kind == "heic" else _decode(data, limits)
+    warnings = (f"declared {media_type}, read as {kind}",) if declared not in (None, kind) else ()
+    height, width = stored.shape[:2]
+    return Photograph(turned(stored, orientation), kind, orientation, width, height, warnings)
+
+
+def turned(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """The upright picture [h, w, ...] of a stored one; ``orientation`` is EXIF's, 1..8."""
+    transposed, flip_u, flip_v = TURNS[orientation]
+    if transposed:
+        pixels = pixels.swapaxes(0, 1)
+    if flip_u:
+        pixels = pixels[:, ::-1]
+    if flip_v:
+        pixels = pixels[::-1]
+    return np.ascontiguousarray(pixels)
+
+
+def _declared_kind(media_type: str | None) -> Kind | None:
+    name = (media_type or "").partition(";")[0].strip().lower()
+    if name in UNDECLARED:
+        return None
+    if name not in MEDIA_TYPES:
+        raise UnsupportedKind(f"{name} is no photograph: send one of {', '.join(MEDIA_TYPES)}")
+    return MEDIA_TYPES[name]
+
+
+def _require_pixels(width_px: int, height_px: int, limits: ImageLimits) -> None:
+    most = min(limits.max_pixels, PIXEL_CEILING)
+    if width_px * height_px > most:
+        raise TooLarge(f"the picture has {width_px}x{height_px} pixels, more than the {most} accepted")
+
+
+def _decode(data: bytes, limits: ImageLimits) -> tuple[NDArray[np.uint8], int]:
+    header = read_header(data)
+    _require_pixels(header.width_px, header.height_px, limits)
+    try:
+        pixels = cv2.imdecode(np.frombuffer(_unturned(data, header), np.uint8), DECODE_FLAGS)
+    except cv2.error as exc:
+        raise InvalidImage(f"the {header.kind} file cannot be decoded: it is damaged") from exc
+    if pixels is None or pixels.shape[:2] != (header.height_px, header.width_px):
+        raise InvalidImage(f"the {header.kind} file cannot be decoded: it is damaged or of an unusual form")
+    return _eight_bits(pixels), header.orientation
+
+
+def _unturned(data: bytes, header: Header) -> bytes:
+    """The file with no orientation of its own: OpenCV turns every TIFF, whatever it is told."""
+    if header.orientation_offset is None or header.orientation == 1:
+        return data
+    stored = bytearray(data)
+    upright = (1).to_bytes(2, "little" if data[:2] == b"II" else "big")
+    stored[header.orientation_offset : header.orientation_offset + 2] = upright
+    return bytes(stored)
+
+
+def _eight_bits(pixels: NDArray[Any]) -> NDArray[np.uint8]:
+    if pixels.dtype == np.uint16:
+        pixels = cv2.convertScaleAbs(pixels, alpha=1 / 257)
+    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
+        raise InvalidImage(f"pixels of type {pixels.dtype} are not supported: send 8 or 16 bits a channel")
+    return np.asarray(pixels, np.uint8)
+
+
+def _decode_heic(data: bytes, limits: ImageLimits) -> tuple[NDArray[np.uint8], int]:
+    """HEIC through the optional decoder, which turns the picture itself: the orientation left is 1."""
+    try:
+        import pi_heif
+    except ImportError as exc:
+        raise UnsupportedKind("HEIC needs the service's extra 'heic': send JPEG instead") from exc
+    try:
+        picture = pi_heif.open_heif(data, convert_hdr_to_8bit=True)
+        width_px, height_px = picture.size
+        _require_pixels(width_px, height_px, limits)
+        pixels = np.asarray(picture)
+    except (ValueError, EOFError, RuntimeError, SyntaxError, OSError) as exc:
+        raise InvalidImage("the heic file cannot be decoded: it is cut off or damaged") from exc
+    return _eight_bits(pixels[..., :3]), 1

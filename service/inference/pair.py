@@ -1,0 +1,101 @@
+"""The two graphs and the correction between them: one RGB array and its camera to raw maps.
+
+Maps are those of the graphs: ``stride`` pixels of the image to one of theirs, depth as a ratio to the focus
+distance, nothing decided yet.
+"""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.inference.artifact import Manifest, ModelFolder
+from service.inference.cancellation import Cancellation
+from service.inference.session import Graph
+from service.opencv import cv2
+from service.optics import thin_lens
+from service.optics.camera import Camera
+
+Side = Literal["auto", "near", "far"]
+SIDE_HINTS: dict[Side, float] = {"auto": 0.0, "near": -1.0, "far": 1.0}
+BLUR_ERROR_RANGE = (0.01, 2.0)
+MAPS = ("blur_px", "log_ratio_near", "log_ratio_far", "p_near", "log_scale")
+
+RawMaps = dict[str, NDArray[np.float32]]
+
+
+@dataclass(slots=True)
+class Stopwatch:
+    """Milliseconds by stage, added up over tiles and scales."""
+
+    elapsed_ms: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        started = time.perf_counter()
+        try:
+            yield
+        finally:
+            spent = (time.perf_counter() - started) * 1e3
+            self.elapsed_ms[name] = self.elapsed_ms.get(name, 0.0) + spent
+
+
+class GraphPair:
+    """blur.onnx and depth.onnx, loaded; holds no state between calls."""
+
+    def __init__(self, folder: ModelFolder, intra_op_threads: int) -> None:
+        graphs = folder.manifest.graphs
+        self.manifest: Manifest = folder.manifest
+        self._blur = Graph(folder.blur_graph, graphs.blur, intra_op_threads)
+        self._depth = Graph(folder.depth_graph, graphs.depth, intra_op_threads)
+
+    def read(
+        self,
+        rgb: NDArray[np.uint8],
+        camera: Camera,
+        side: Side,
+        cancellation: Cancellation,
+        stopwatch: Stopwatch,
+    ) -> RawMaps:
+        """Raw maps, each float32 [ceil(h/stride), ceil(w/stride)], of an image uint8 [h, w, 3].
+
+        ``camera`` is at the scale of the image, of which this may be a part: a crop changes no blur.
+        """
+        with stopwatch.stage("blur"):
+            seen = self._blur.run({"image": self._padded(rgb)}, cancellation)
+        with stopwatch.stage("correct"):
+            feeds = _corrected(seen, camera, side)
+        with stopwatch.stage("depth"):
+            told = self._depth.run(feeds, cancellation)
+        rows, columns = (-(-size // self.manifest.stride) for size in rgb.shape[:2])
+        return {name: (seen | told)[name][0, 0, :rows, :columns] for name in MAPS}
+
+    def _padded(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """float32 [1, 3, h, w] in 0..1, mirrored at the right and bottom up to the next multiple."""
+        bottom, right = (-size % self.manifest.multiple for size in rgb.shape[:2])
+        padded = cv2.copyMakeBorder(rgb, 0, bottom, 0, right, cv2.BORDER_REFLECT)
+        image = np.ascontiguousarray(padded.transpose(2, 0, 1)[np.newaxis], dtype=np.float32)
+        image /= 255.0
+        return image
+
+
+def _corrected(seen: RawMaps, camera: Camera, side: Side) -> RawMaps:
+    """What the depth graph is given: blur with the camera taken out (eq. 6 and 7), and the camera itself."""
+    blur_px = seen["blur_px"]
+    gamma_px, k_cam_px = camera.gamma_px, camera.k_cam_px
+    relative_error = np.clip(np.exp(seen["blur_log_error"]), *BLUR_ERROR_RANGE).astype(np.float32)
+    focal_length_px = camera.intrinsics.fx_px if camera.intrinsics else 0.0
+    return {
+        **{name: value for name, value in seen.items() if name not in ("blur_px", "blur_log_error")},
+        "relative_defocus": thin_lens.relative_defocus_from_blur(blur_px, gamma_px, k_cam_px),
+        "relative_defocus_spread": thin_lens.relative_defocus_spread(
+            blur_px, relative_error, gamma_px, k_cam_px
+        ),
+        "focus_distance_m": np.array([camera.focus_distance_m], np.float32),
+        "focal_length_px": np.array([focal_length_px], np.float32),
+        "side": np.array([SIDE_HINTS[side]], np.float32),
+    }

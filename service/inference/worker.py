@@ -1,0 +1,116 @@
+"""A bounded pool of threads for the heavy work: slots, a queue, a deadline and cancellation.
+
+A slot is held until its thread really ends, so that work nobody waits for any more still counts.
+"""
+
+import asyncio
+import math
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Concatenate, Generic, ParamSpec, TypeVar
+
+from service.errors import Busy
+from service.inference.cancellation import Cancellation, Cancelled
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+FIRST_GUESS_S = 1.0
+MEMORY_OF_DURATION = 0.8
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome(Generic[T]):
+    """What the work returned, and how long it waited for a slot, in milliseconds."""
+
+    value: T
+    wait_ms: float
+
+
+class Worker:
+    """Runs functions that take a ``Cancellation`` first; made and closed with the app."""
+
+    def __init__(self, *, slots: int, queue_size: int, deadline_s: float) -> None:
+        if slots < 1 or queue_size < 0 or not deadline_s > 0:
+            raise ValueError("a worker needs at least one slot, no negative queue and a positive deadline")
+        self.slots = slots
+        self.queue_size = queue_size
+        self.deadline_s = deadline_s
+        self._pool = ThreadPoolExecutor(max_workers=slots, thread_name_prefix="inference")
+        self._lock = threading.Lock()
+        self._live: set[Cancellation] = set()
+        self._typical_s = FIRST_GUESS_S
+
+    @property
+    def in_flight(self) -> int:
+        """Running and queued together."""
+        return len(self._live)
+
+    async def run(
+        self, work: Callable[Concatenate[Cancellation, P], T], *args: P.args, **kwargs: P.kwargs
+    ) -> Outcome[T]:
+        """Run the work in a slot; cancelling the awaiting task asks the work to stop.
+
+        Raises ``Busy`` when the queue is full or the deadline passes, and whatever the work raises.
+        """
+        cancellation = self._admit()
+        future = self._submit(cancellation, lambda: work(cancellation, *args, **kwargs))
+        try:
+            async with asyncio.timeout(self.deadline_s) as deadline:
+                return await asyncio.wrap_future(future)
+        except TimeoutError as exc:
+            if not deadline.expired():
+                raise
+            raise Busy(
+                f"no answer within {self.deadline_s:g} s: try again later or send a smaller photograph",
+                retry_after_s=self._retry_after_s(),
+            ) from exc
+        except Cancelled as exc:
+            raise Busy("the service is stopping") from exc
+        finally:
+            cancellation.cancel()
+
+    def close(self) -> None:
+        """Ask everything to stop, and wait until it has."""
+        for cancellation in tuple(self._live):
+            cancellation.cancel()
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def _admit(self) -> Cancellation:
+        cancellation = Cancellation()
+        with self._lock:
+            if len(self._live) >= self.slots + self.queue_size:
+                raise Busy(
+                    f"{len(self._live)} requests are running or queued, which is all there is room for",
+                    retry_after_s=self._retry_after_s(),
+                )
+            self._live.add(cancellation)
+        return cancellation
+
+    def _submit(self, cancellation: Cancellation, work: Callable[[], T]) -> Future[Outcome[T]]:
+        submitted = time.perf_counter()
+
+        def timed() -> Outcome[T]:
+            started = time.perf_counter()
+            cancellation.check()
+            value = work()
+            self._remember(time.perf_counter() - started)
+            return Outcome(value, (started - submitted) * 1e3)
+
+        try:
+            future = self._pool.submit(timed)
+        except RuntimeError as exc:
+            self._live.discard(cancellation)
+            raise Busy("the service is stopping") from exc
+        future.add_done_callback(lambda _: self._live.discard(cancellation))
+        return future
+
+    def _remember(self, duration_s: float) -> None:
+        self._typical_s = MEMORY_OF_DURATION * self._typical_s + (1 - MEMORY_OF_DURATION) * duration_s
+
+    def _retry_after_s(self) -> int:
+        """When a slot is likely free: the queue's length in typical durations, in whole seconds."""
+        return max(1, math.ceil(self._typical_s * len(self._live) / self.slots))

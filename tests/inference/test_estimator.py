@@ -1,0 +1,188 @@
+"""From brightness to metres through real graphs: correction, scales, sides, no answer."""
+
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from service.inference.artifact import Interval, load_model_folder
+from service.inference.cancellation import Cancellation, Cancelled
+from service.inference.estimator import Estimator
+from service.inference.pair import GraphPair
+from service.optics import thin_lens
+from service.optics.camera import Camera, Intrinsics
+from tests.inference.oracle_pair import LOG_DEPTH_SCALE, blur_of, build_oracle_pair
+
+CAMERA = Camera(96, 64, 2.0, 6.0, 0.5)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build_oracle_pair(tmp_path_factory.mktemp("model"))
+
+
+@pytest.fixture(scope="module")
+def estimator(folder: Path) -> Estimator:
+    return Estimator.from_folder(load_model_folder(folder))
+
+
+def grey(level: int, height: int = 64, width: int = 96) -> NDArray[np.uint8]:
+    return np.full((height, width, 3), level, np.uint8)
+
+
+def expected_x(level: int, camera: Camera = CAMERA) -> float:
+    return thin_lens.relative_defocus_from_blur(blur_of(level), camera.gamma_px, camera.k_cam_px)
+
+
+@pytest.mark.parametrize("level", [0, 20, 60, 100, 140])
+def test_a_level_of_blur_becomes_the_thin_lens_depth_on_either_side(estimator: Estimator, level: int) -> None:
+    x = expected_x(level)
+    near = estimator.estimate(grey(level), CAMERA, "near")
+    far = estimator.estimate(grey(level), CAMERA, "far")
+    np.testing.assert_allclose(near.depth_m, thin_lens.depth_near(x, 2.0), rtol=1e-4)
+    np.testing.assert_allclose(far.depth_m, thin_lens.depth_far(x, 2.0), rtol=1e-4)
+    np.testing.assert_allclose(near.depth_alt_m, far.depth_m, rtol=1e-6)
+    np.testing.assert_allclose(near.blur_px, blur_of(level), rtol=1e-4)
+    assert (near.p_near == 1).all()
+    assert (far.p_near == 0).all()
+
+
+def test_sigma_is_root_two_times_the_laplace_scale_times_depth(estimator: Estimator) -> None:
+    answer = estimator.estimate(grey(80), CAMERA, "near")
+    np.testing.assert_allclose(answer.sigma_m, np.sqrt(2) * LOG_DEPTH_SCALE * answer.depth_m, rtol=1e-4)
+
+
+def test_relative_defocus_of_one_and_more_is_near_whatever_is_asked(estimator: Estimator) -> None:
+    level = 200
+    x = expected_x(level)
+    assert x > 1
+    for side in ("auto", "near", "far"):
+        answer = estimator.estimate(grey(level), CAMERA, side)
+        np.testing.assert_allclose(answer.depth_m, thin_lens.depth_near(x, 2.0), rtol=1e-4)
+        assert np.isnan(answer.depth_alt_m).all()
+        assert (answer.p_near == 1).all()
+
+
+def test_auto_follows_the_features_handed_from_graph_to_graph(estimator: Estimator) -> None:
+    rgb = grey(0)
+    rgb[:, :48, 0] = 180
+    rgb[:, 48:, 1] = 180
+    answer = estimator.estimate(rgb, CAMERA)
+    assert (answer.depth_m[:, :40] < 2).all()
+    assert (answer.depth_m[:, 56:] > 2).all()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 5), (17, 33), (100, 250)])
+def test_any_size_is_answered_at_its_own_size(estimator: Estimator, size: tuple[int, int]) -> None:
+    height, width = size
+    answer = estimator.estimate(grey(60, height, width), Camera(width, height, 2.0, 6.0), "near")
+    assert answer.depth_m.shape == size
+    assert answer.valid.all()
+    np.testing.assert_allclose(answer.depth_m, answer.depth_m[0, 0], rtol=1e-5)
+
+
+def test_maps_are_aligned_with_the_photograph_to_a_fraction_of_a_pixel(estimator: Estimator) -> None:
+    ramp = np.linspace(20, 140, 96).round().astype(np.uint8)
+    rgb = np.repeat(np.repeat(ramp[np.newaxis, :, np.newaxis], 64, axis=0), 3, axis=2)
+    answer = estimator.estimate(rgb, CAMERA, "near")
+    np.testing.assert_allclose(answer.blur_px[32, 2:-2], ramp[2:-2] / 255 * 10, atol=0.04)
+
+
+def test_a_large_k_cam_is_read_on_a_smaller_copy_and_reported(estimator: Estimator) -> None:
+    camera = Camera(600, 400, 2.0, 48.0, 0.5)
+    answer = estimator.estimate(grey(100, 400, 600), camera, "near")
+    assert answer.scales == (0.25,)
+    working_blur = blur_of(100)
+    x = thin_lens.relative_defocus_from_blur(working_blur, 0.125, 12.0)
+    np.testing.assert_allclose(answer.depth_m, thin_lens.depth_near(x, 2.0), rtol=1e-4)
+    np.testing.assert_allclose(answer.blur_px, working_blur * 4, rtol=1e-4)
+    assert "read at 0.25 of full size (150x100)" in answer.warnings
+    assert answer.camera is camera
+
+
+def test_a_small_copy_keeps_the_place_of_things(estimator: Estimator) -> None:
+    rgb = grey(20, 403, 605)
+    rgb[:, 300:] = 120
+    answer = estimator.estimate(rgb, Camera(605, 403, 2.0, 40.0, 0.5), "near")
+    middle = (answer.blur_px[200, 0] + answer.blur_px[200, -1]) / 2
+    assert abs(int(np.argmax(answer.blur_px[200] > middle)) - 300) <= 1
+
+
+def test_blur_beyond_one_scale_is_read_on_a_second_one(tmp_path: Path) -> None:
+    folder = build_oracle_pair(tmp_path / "model", blur_range=Interval(0.3, 8.0))
+    narrow = Estimator.from_folder(load_model_folder(folder))
+    answer = narrow.estimate(grey(200), CAMERA, "near")
+    assert answer.scales == pytest.approx((1, 1 / 3))
+    assert any(warning.startswith("read at 0.333") for warning in answer.warnings)
+
+
+def test_what_lies_outside_the_trained_ranges_is_said(estimator: Estimator) -> None:
+    camera = Camera(96, 64, 30.0, 0.2, 3.0, intrinsics=Intrinsics(20, 20, 48, 32))
+    told = " / ".join(estimator.estimate(grey(60), camera).warnings)
+    for name in ("k_cam_px", "gamma_px", "focus_distance_m", "fx_px"):
+        assert name in told
+
+
+def test_an_answer_that_is_too_unsure_is_none(tmp_path: Path) -> None:
+    unsure = Estimator.from_folder(load_model_folder(build_oracle_pair(tmp_path / "m", depth_scale=0.6)))
+    answer = unsure.estimate(grey(60), CAMERA, "near")
+    assert not answer.valid.any()
+    for hidden in (answer.depth_m, answer.depth_alt_m, answer.sigma_m):
+        assert np.isnan(hidden).all()
+    assert "only 0% of the pixels have an answer" in answer.warnings
+
+
+def test_two_threads_get_the_answer_of_one(estimator: Estimator) -> None:
+    levels = [10, 50, 90, 130]
+    found: dict[int, float] = {}
+
+    def ask(level: int) -> None:
+        found[level] = float(estimator.estimate(grey(level), CAMERA, "near").depth_m[0, 0])
+
+    threads = [threading.Thread(target=ask, args=(level,)) for level in levels]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for level in levels:
+        assert found[level] == pytest.approx(thin_lens.depth_near(expected_x(level), 2.0), rel=1e-4)
+
+
+def test_a_camera_of_another_size_is_refused(estimator: Estimator) -> None:
+    with pytest.raises(ValueError, match="64x96"):
+        estimator.estimate(grey(60, 96, 64), CAMERA)
+
+
+def test_cancelled_work_stops(estimator: Estimator) -> None:
+    cancellation = Cancellation()
+    cancellation.cancel()
+    with pytest.raises(Cancelled):
+        estimator.estimate(grey(60), CAMERA, "auto", cancellation)
+
+
+def test_a_run_inside_the_graph_stops_when_asked(folder: Path) -> None:
+    pair = GraphPair(load_model_folder(folder), intra_op_threads=1)
+    cancellation = Cancellation()
+    ended: list[BaseException] = []
+
+    def keep_reading() -> None:
+        try:
+            while True:
+                Estimator(pair).estimate(grey(60, 640, 960), Camera(960, 640, 2.0, 6.0), "auto", cancellation)
+        except Cancelled as exc:
+            ended.append(exc)
+
+    thread = threading.Thread(target=keep_reading)
+    thread.start()
+    cancellation.cancel()
+    thread.join(timeout=20)
+    assert not thread.is_alive()
+    assert len(ended) == 1
+
+
+def test_the_stages_are_timed(estimator: Estimator) -> None:
+    timings = estimator.estimate(grey(60), CAMERA).timings_ms
+    assert set(timings) == {"blur", "correct", "depth"}
+    assert all(spent > 0 for spent in timings.values())
