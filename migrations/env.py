@@ -1,4 +1,4 @@
-"""Alembic's entry: on the connection it is handed, or, from Alembic's own command line, on the configured one."""
+"""Alembic's entry: on the connection it is handed, or, from its own command line, on the configured one."""
 
 from alembic import context
 from sqlalchemy import Connection

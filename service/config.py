@@ -107,7 +107,7 @@ class Settings(BaseSettings):
 
     @property
     def threads_per_worker(self) -> int:
-        """Threads inside one graph run; times ``worker_slots`` at most the cores, unless one slot asks for more."""
+        """Threads inside one graph run; times ``worker_slots`` at most the cores."""
         return self.intra_op_threads or max(1, available_cores() // self.worker_slots)
 
     @property

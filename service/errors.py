@@ -18,13 +18,14 @@ CamindError
 Domain code raises these and knows no HTTP beyond the class; one handler turns them into problem+json.
 """
 
+# ruff: noqa: N818  (the names say what went wrong, and all of them are errors)
 from dataclasses import dataclass
 from typing import ClassVar
 
 
 @dataclass(frozen=True, slots=True)
 class FieldProblem:
-    """One fault at one place: a JSON pointer (``#/lens/f_number``), header or parameter name, and what to do."""
+    """One fault at one place: a JSON pointer (``#/lens/f_number``) or a header's or parameter's name."""
 
     pointer: str
     detail: str

@@ -82,9 +82,10 @@ EXAMPLES: dict[str, tuple[str, tuple[FieldProblem, ...]]] = {
 
 
 def responses(*errors: type[CamindError]) -> dict[int | str, dict[str, Any]]:
-    """What a route passes as ``responses=``: one entry per status, one example per kind of error."""
+    """What a route passes as ``responses=``: one entry per status, one example per kind of error, and 500."""
     documented: dict[int | str, dict[str, Any]] = {}
-    for error in errors:
+    every: tuple[type[CamindError], ...] = (*errors, CamindError)
+    for error in every:
         entry = documented.setdefault(error.status, _empty_entry(error))
         entry["content"][PROBLEM_TYPE]["examples"][error.code] = {
             "summary": error.title,
@@ -145,7 +146,7 @@ def _unknown_field(name: str) -> str:
     if "35" in name:
         return (
             "A 35-mm-equivalent focal length is not the lens' focal length, and k_cam grows with its square: "
-            "send the real one as focal_length_mm (it stands on the lens, or as FocalLength in the EXIF data)."
+            "send the real one as focal_length_mm (printed on the lens, and FocalLength in EXIF)."
         )
     return "There is no such field: remove it, or correct its name."
 

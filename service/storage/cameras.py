@@ -23,6 +23,7 @@ NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 DEFAULT_K_R = 4.0
 
 Source = Literal["given", "lens", "calibration"]
+SOURCES: tuple[Source, ...] = ("given", "lens", "calibration")
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,14 +185,14 @@ def _to_revision_row(camera_id: int, number: int, draft: CameraDraft, now: datet
         k_cam_px=camera.k_cam_px,
         gamma_px=camera.gamma_px,
         k_r=draft.k_r,
-        focal_length_mm=lens and lens.focal_length_mm,
-        f_number=lens and lens.f_number,
-        pixel_pitch_um=lens and lens.pixel_pitch_um,
-        sensor_width_px=lens and lens.sensor_width_px,
-        fx_px=intrinsics and intrinsics.fx_px,
-        fy_px=intrinsics and intrinsics.fy_px,
-        cx_px=intrinsics and intrinsics.cx_px,
-        cy_px=intrinsics and intrinsics.cy_px,
+        focal_length_mm=lens.focal_length_mm if lens else None,
+        f_number=lens.f_number if lens else None,
+        pixel_pitch_um=lens.pixel_pitch_um if lens else None,
+        sensor_width_px=lens.sensor_width_px if lens else None,
+        fx_px=intrinsics.fx_px if intrinsics else None,
+        fy_px=intrinsics.fy_px if intrinsics else None,
+        cx_px=intrinsics.cx_px if intrinsics else None,
+        cy_px=intrinsics.cy_px if intrinsics else None,
         distortion=list(intrinsics.distortion) if intrinsics else None,
     )
 
@@ -229,6 +230,7 @@ def _to_intrinsics(row: CameraRevisionRow) -> Intrinsics | None:
 
 
 def _to_source(value: str) -> Source:
-    if value not in ("given", "lens", "calibration"):
-        raise ValueError(f"a stored camera has the unknown source {value!r}")
-    return value
+    for source in SOURCES:
+        if source == value:
+            return source
+    raise ValueError(f"a stored camera has the unknown source {value!r}")

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from sqlalchemy import Connection, Engine, create_engine, event, make_url
-from sqlalchemy.exc import DBAPIError, IntegrityError, OperationalError
+from sqlalchemy.exc import InternalError, OperationalError, ProgrammingError
 from sqlalchemy.pool import ConnectionPoolEntry
 from sqlmodel import Session
 
@@ -53,6 +53,12 @@ def writing(engine: Engine) -> Iterator[Session]:
         yield session
 
 
+def require_writable(engine: Engine) -> None:
+    """Raise ``NotReady`` where the database takes no writes: a full disk, a read-only file or replica."""
+    with writing(engine) as session:
+        session.connection().exec_driver_sql("UPDATE cameras SET revision = revision WHERE id = -1")
+
+
 def _prepare_sqlite(connection: sqlite3.Connection, _: ConnectionPoolEntry) -> None:
     connection.isolation_level = None  # the driver would begin too late; _begin_sqlite does it
     for pragma in (
@@ -74,13 +80,7 @@ def _begin_sqlite(connection: Connection) -> None:
 def _translated() -> Iterator[None]:
     try:
         yield
-    except IntegrityError:
-        raise
-    except OperationalError as exc:
+    except (OperationalError, InternalError, ProgrammingError) as exc:
         if "locked" in str(exc.orig):
             raise Busy("The database is busy: try again in a second.") from exc
-        raise NotReady("The database does not answer: look at the service's log.") from exc
-    except DBAPIError as exc:
-        if exc.connection_invalidated:
-            raise NotReady("The database does not answer: look at the service's log.") from exc
-        raise
+        raise NotReady("The database cannot be used: the service's log says why.") from exc

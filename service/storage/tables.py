@@ -33,7 +33,7 @@ class UtcDateTime(TypeDecorator[datetime]):
 
 
 class CameraRow(SQLModel, table=True):
-    """A name and the revision it stands for now. A deleted name keeps its row, and so its count of revisions."""
+    """A name and the revision it stands for now; a deleted name keeps its row, and its count of revisions."""
 
     __tablename__ = "cameras"
     __table_args__ = (UniqueConstraint("name"),)

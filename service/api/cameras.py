@@ -1,0 +1,175 @@
+"""``/cameras``: register, read, replace, delete, list, and the blur curve of a camera."""
+
+import re
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Header, Query, Response
+
+from service.api.cursors import cursor_after, name_of
+from service.api.dependencies import CamerasDep, require_json
+from service.api.problems import responses
+from service.api.schemas import (
+    CameraCreate,
+    CameraPage,
+    CameraRead,
+    CameraReplace,
+    CurvePoint,
+    CurveRead,
+)
+from service.errors import (
+    BadRequest,
+    Busy,
+    Conflict,
+    FieldProblem,
+    NotFound,
+    NotReady,
+    PreconditionFailed,
+    ReceiveTimeout,
+    TooLarge,
+    UnsupportedKind,
+)
+from service.optics import thin_lens
+from service.optics.camera import RANGE_BLUR_ERROR_PX, Camera
+from service.storage.cameras import CameraRecord
+
+BODY_ERRORS = (BadRequest, ReceiveTimeout, TooLarge, UnsupportedKind)
+STORE_ERRORS = (Busy, NotReady)
+ETAG = {"ETag": {"description": "The revision, for If-Match", "schema": {"type": "string"}}}
+LOCATION = {"Location": {"description": "The camera's path", "schema": {"type": "string"}}}
+CURVE_SPAN = 5.0
+
+router = APIRouter(prefix="/cameras", tags=["cameras"])
+
+IfMatch = Annotated[
+    str | None, Header(description="ETag of the revision that is to be changed; another one answers 412")
+]
+Depth = Annotated[float | None, Query(gt=0, le=100_000, allow_inf_nan=False, description="Metres")]
+
+
+@router.post(
+    "",
+    operation_id="createCamera",
+    status_code=201,
+    summary="Register a camera",
+    dependencies=[Depends(require_json)],
+    responses={201: {"headers": {**LOCATION, **ETAG}}, **responses(Conflict, *BODY_ERRORS, *STORE_ERRORS)},
+)
+def create_camera(body: CameraCreate, cameras: CamerasDep, response: Response) -> CameraRead:
+    """Register a camera from its k_cam or from its lens specs; no training is needed."""
+    record = cameras.add(body.to_draft(body.name))
+    response.headers["Location"] = f"/cameras/{record.name}"
+    return _answer(record, response)
+
+
+@router.get(
+    "",
+    operation_id="listCameras",
+    summary="List cameras by name",
+    responses=responses(BadRequest, *STORE_ERRORS),
+)
+def list_cameras(
+    cameras: CamerasDep,
+    limit: Annotated[int, Query(ge=1, le=200)] = 50,
+    cursor: Annotated[
+        str | None, Query(max_length=200, description="`next_cursor` of the page before")
+    ] = None,
+) -> CameraPage:
+    """Cameras at their current revisions, a page at a time."""
+    records, has_more = cameras.page(limit, name_of(cursor))
+    return CameraPage(
+        items=[CameraRead.from_record(record) for record in records],
+        next_cursor=cursor_after(records[-1].name) if has_more else None,
+    )
+
+
+@router.get(
+    "/{name}",
+    operation_id="readCamera",
+    summary="Read a camera",
+    responses={200: {"headers": ETAG}, **responses(NotFound, *STORE_ERRORS)},
+)
+def read_camera(name: str, cameras: CamerasDep, response: Response) -> CameraRead:
+    """The camera at its current revision."""
+    return _answer(cameras.get(name), response)
+
+
+@router.put(
+    "/{name}",
+    operation_id="replaceCamera",
+    summary="Give a camera a new revision",
+    dependencies=[Depends(require_json)],
+    responses={
+        200: {"headers": ETAG},
+        **responses(NotFound, PreconditionFailed, *BODY_ERRORS, *STORE_ERRORS),
+    },
+)
+def replace_camera(
+    name: str, body: CameraReplace, cameras: CamerasDep, response: Response, if_match: IfMatch = None
+) -> CameraRead:
+    """Replace the camera whole; the revision before stays in the database."""
+    record = cameras.replace(body.to_named_draft(name), _revisions(if_match))
+    return _answer(record, response)
+
+
+@router.delete(
+    "/{name}",
+    operation_id="deleteCamera",
+    status_code=204,
+    summary="Delete a camera",
+    responses=responses(NotFound, PreconditionFailed, *STORE_ERRORS),
+)
+def delete_camera(name: str, cameras: CamerasDep, if_match: IfMatch = None) -> None:
+    """Free the name. A camera registered under it later goes on counting revisions."""
+    cameras.delete(name, _revisions(if_match))
+
+
+@router.get(
+    "/{name}/curve",
+    operation_id="readCameraCurve",
+    summary="Blur against distance",
+    responses=responses(NotFound, BadRequest, *STORE_ERRORS),
+)
+def read_curve(
+    name: str,
+    cameras: CamerasDep,
+    near_m: Depth = None,
+    far_m: Depth = None,
+    points: Annotated[int, Query(ge=2, le=2_000, description="Evenly spaced in distance")] = 101,
+) -> CurveRead:
+    """The blur the camera shows by distance, by default from a fifth to five times its focus distance."""
+    record = cameras.get(name)
+    focus_m = record.camera.focus_distance_m
+    near = near_m if near_m is not None else min(focus_m, far_m or focus_m) / CURVE_SPAN
+    far = far_m if far_m is not None else max(focus_m, near_m or focus_m) * CURVE_SPAN
+    if near >= far:
+        detail = "near_m must be smaller than far_m."
+        raise BadRequest(detail, errors=(FieldProblem("near_m", detail), FieldProblem("far_m", detail)))
+    depths = [near + (far - near) * step / (points - 1) for step in range(points)]
+    return CurveRead(
+        camera=record.name,
+        revision=record.revision,
+        focus_distance_m=focus_m,
+        points=[_curve_point(record.camera, depth_m) for depth_m in depths],
+    )
+
+
+def _answer(record: CameraRecord, response: Response) -> CameraRead:
+    response.headers["ETag"] = f'"{record.revision}"'
+    return CameraRead.from_record(record)
+
+
+def _revisions(if_match: str | None) -> list[int] | None:
+    """The revisions that If-Match allows, ``None`` for any; weak and foreign tags match none (RFC 9110)."""
+    if if_match is None or if_match.strip() == "*":
+        return None
+    return [int(number) for number in re.findall(r'(?<!W/)"(\d{1,9})"', if_match)]
+
+
+def _curve_point(camera: Camera, depth_m: float) -> CurvePoint:
+    focus_m, k_cam_px = camera.focus_distance_m, camera.k_cam_px
+    return CurvePoint(
+        depth_m=depth_m,
+        blur_px=camera.blur_px(depth_m),
+        defocus_px=thin_lens.defocus_at_depth(depth_m, focus_m, k_cam_px),
+        depth_error_m=thin_lens.depth_error(depth_m, focus_m, k_cam_px, RANGE_BLUR_ERROR_PX),
+    )

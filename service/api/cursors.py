@@ -1,0 +1,29 @@
+"""List cursors: opaque to clients, and checked when they come back."""
+
+import re
+from base64 import urlsafe_b64decode, urlsafe_b64encode
+
+from service.errors import BadRequest, FieldProblem
+from service.storage.cameras import NAME_PATTERN
+
+PREFIX = "after:"
+
+
+def cursor_after(name: str) -> str:
+    """A cursor for what comes behind the name."""
+    return urlsafe_b64encode(f"{PREFIX}{name}".encode()).decode().rstrip("=")
+
+
+def name_of(cursor: str | None) -> str | None:
+    """The name in a cursor, ``None`` for none. Raises ``BadRequest`` for a cursor that never was one."""
+    if cursor is None:
+        return None
+    try:
+        text = urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)).decode()
+    except ValueError:
+        text = ""
+    name = text.removeprefix(PREFIX)
+    if not text.startswith(PREFIX) or not re.fullmatch(NAME_PATTERN, name):
+        detail = "This cursor is none of ours: take next_cursor from the page before, or leave it out."
+        raise BadRequest(f"cursor: {detail}", errors=(FieldProblem("cursor", detail),))
+    return name

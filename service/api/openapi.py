@@ -1,0 +1,90 @@
+"""The OpenAPI document: FastAPI's, with our one error schema and the header every answer carries."""
+
+import json
+import re
+from collections.abc import Iterator
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+
+from service.api.problems import Problem
+
+# words that YAML reads as truth values or nothing
+YAML_WORDS = frozenset({"null", "true", "false", "yes", "no", "on", "off", "y", "n"})
+REF = "#/components/schemas/{model}"
+FRAMEWORK_SCHEMAS = ("HTTPValidationError", "ValidationError")
+REQUEST_ID_REF = {"$ref": "#/components/headers/RequestId"}
+REQUEST_ID = {
+    "description": "The request's id: the one sent, or a new one; the log has it too",
+    "schema": {"type": "string"},
+}
+
+
+def describe(app: FastAPI) -> dict[str, Any]:
+    """The app's OpenAPI document, built once."""
+    if app.openapi_schema is None:
+        document = get_openapi(
+            title=app.title,
+            version=app.version,
+            summary=app.summary,
+            description=app.description,
+            routes=app.routes,
+            tags=app.openapi_tags,
+            license_info=app.license_info,
+        )
+        _add_components(document)
+        for operations in document["paths"].values():
+            for operation in operations.values():
+                _complete(operation)
+        app.openapi_schema = document
+    return app.openapi_schema
+
+
+def _add_components(document: dict[str, Any]) -> None:
+    components = document.setdefault("components", {})
+    schemas = components.setdefault("schemas", {})
+    for name in FRAMEWORK_SCHEMAS:
+        schemas.pop(name, None)
+    problem = Problem.model_json_schema(ref_template=REF)
+    schemas.update(problem.pop("$defs", {}))
+    schemas["Problem"] = problem
+    components["headers"] = {"RequestId": REQUEST_ID}
+
+
+def _complete(operation: dict[str, Any]) -> None:
+    # the framework assumes its own 422 wherever a route takes a parameter and documents none
+    if "HTTPValidationError" in str(operation["responses"].get("422", "")):
+        del operation["responses"]["422"]
+    for answer in operation["responses"].values():
+        answer.setdefault("headers", {})["X-Request-Id"] = REQUEST_ID_REF
+
+
+def to_yaml(document: object) -> str:
+    """JSON data as YAML in block style; scalars are written as JSON, which YAML reads alike."""
+    return "\n".join(_lines(document, 0)) + "\n"
+
+
+def _lines(value: object, depth: int) -> Iterator[str]:
+    indent = "  " * depth
+    if isinstance(value, dict) and value:
+        for key, item in value.items():
+            yield from _entry(f"{indent}{_key(str(key))}:", item, depth + 1)
+    elif isinstance(value, list) and value:
+        for item in value:
+            yield from _entry(f"{indent}-", item, depth + 1)
+    else:
+        yield indent + json.dumps(value, ensure_ascii=False)
+
+
+def _entry(head: str, item: object, depth: int) -> Iterator[str]:
+    if isinstance(item, dict | list) and item:
+        yield head
+        yield from _lines(item, depth)
+    else:
+        yield f"{head} {json.dumps(item, ensure_ascii=False)}"
+
+
+def _key(text: str) -> str:
+    is_plain = re.fullmatch(r"[$/A-Za-z][\w${}/.-]*", text) and text.lower() not in YAML_WORDS
+    return text if is_plain else json.dumps(text, ensure_ascii=False)

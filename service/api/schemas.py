@@ -1,0 +1,297 @@
+"""Cameras on the wire. Unknown fields, strings for numbers, NaN and infinity are refused."""
+
+from datetime import datetime
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, JsonValue
+
+from service.errors import BadRequest, FieldProblem
+from service.optics.camera import Camera, Intrinsics, Lens
+from service.storage.cameras import DEFAULT_K_R, NAME_PATTERN, CameraDraft, CameraRecord
+
+DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
+PLAIN_TEXT = r"^[^\x00-\x08\x0b\x0c\x0e-\x1f\x7f]*$"
+
+Name = Annotated[
+    str, Field(pattern=NAME_PATTERN, description="Unique; stands in the camera's URL", examples=["d200"])
+]
+Pixels = Annotated[int, Field(gt=0, le=100_000)]
+Metres = Annotated[float, Field(gt=0, le=100_000, allow_inf_nan=False)]
+BlurPixels = Annotated[float, Field(gt=0, le=1_000_000, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
+
+
+class Given(BaseModel):
+    """A body as sent: nothing unknown, nothing converted."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+
+class LensSpecs(Given):
+    """Raw lens specs, from which k_cam follows (eq. 2)."""
+
+    focal_length_mm: Annotated[
+        float,
+        Field(
+            gt=0, le=10_000, allow_inf_nan=False, description="Real focal length, never the 35-mm equivalent"
+        ),
+    ]
+    f_number: Annotated[float, Field(gt=0, le=1_000, allow_inf_nan=False, description="Aperture number N")]
+    pixel_pitch_um: Annotated[
+        float, Field(gt=0, le=1_000, allow_inf_nan=False, description="Pitch of one sensor pixel")
+    ]
+    sensor_width_px: Annotated[Pixels, Field(description="Width of the whole sensor in its own pixels")]
+    k_r: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=100,
+            allow_inf_nan=False,
+            description="Diameter of the circle of confusion over its standard deviation; a disc has 4",
+        ),
+    ] = DEFAULT_K_R
+
+    def to_domain(self) -> Lens:
+        """The lens as the physics takes it."""
+        return Lens(self.focal_length_mm, self.f_number, self.pixel_pitch_um, self.sensor_width_px, self.k_r)
+
+
+class PinholeIntrinsics(Given):
+    """Pinhole intrinsics at the camera's image size; pixel (0, 0) is the centre of the top left pixel."""
+
+    fx_px: BlurPixels
+    fy_px: BlurPixels
+    cx_px: Finite
+    cy_px: Finite
+    distortion: Annotated[
+        list[Finite], Field(max_length=14, description="OpenCV's order: 0, 4, 5, 8, 12 or 14 coefficients")
+    ] = []
+
+    def to_domain(self) -> Intrinsics:
+        """The intrinsics as the physics takes them; ``BadRequest`` for a count OpenCV does not know."""
+        if len(self.distortion) not in DISTORTION_LENGTHS:
+            raise _fault(
+                "#/intrinsics/distortion", "Send 0, 4, 5, 8, 12 or 14 coefficients, in OpenCV's order."
+            )
+        return Intrinsics(self.fx_px, self.fy_px, self.cx_px, self.cy_px, tuple(self.distortion))
+
+
+class CameraSpecs(Given):
+    """A camera: exactly one of ``k_cam_px`` and ``lens``."""
+
+    image_width_px: Annotated[Pixels, Field(description="Width of the images it takes, upright")]
+    image_height_px: Annotated[Pixels, Field(description="Height of the images it takes, upright")]
+    focus_distance_m: Annotated[Metres, Field(description="From the lens to the plane in focus")]
+    k_cam_px: Annotated[
+        BlurPixels | None, Field(description="Blur per unit of relative defocus, at `image_width_px`")
+    ] = None
+    lens: LensSpecs | None = None
+    gamma_px: Annotated[
+        float, Field(ge=0, le=1_000, allow_inf_nan=False, description="Blur of a point in perfect focus")
+    ] = 0.5
+    intrinsics: PinholeIntrinsics | None = None
+    description: Annotated[str | None, Field(max_length=1000, pattern=PLAIN_TEXT)] = None
+
+    def to_camera(self) -> Camera:
+        """The camera as the physics takes it; ``BadRequest`` where the numbers do not fit together."""
+        intrinsics = self.intrinsics.to_domain() if self.intrinsics else None
+        lens = self.lens.to_domain() if self.lens else None
+        try:
+            return Camera(
+                image_width_px=self.image_width_px,
+                image_height_px=self.image_height_px,
+                focus_distance_m=self.focus_distance_m,
+                k_cam_px=self._k_cam_px(lens),
+                gamma_px=self.gamma_px,
+                focal_length_m=lens.focal_length_m if lens else None,
+                intrinsics=intrinsics,
+            )
+        except (ValueError, ArithmeticError) as exc:
+            raise _fault("#", f"No camera has these numbers: {exc}.") from exc
+
+    def to_draft(self, name: str) -> CameraDraft:
+        """The camera under a name, with what it was made from."""
+        camera = self.to_camera()
+        lens = self.lens.to_domain() if self.lens else None
+        return CameraDraft(name, camera, "lens" if lens else "given", lens, self.description)
+
+    def _k_cam_px(self, lens: Lens | None) -> float:
+        if lens is None and self.k_cam_px is not None:
+            return self.k_cam_px
+        if lens is None or self.k_cam_px is not None:
+            both = "not both" if lens else "one of them is needed"
+            detail = f"Send exactly one of k_cam_px and lens, {both}."
+            raise BadRequest(
+                detail, errors=(FieldProblem("#/k_cam_px", detail), FieldProblem("#/lens", detail))
+            )
+        if lens.focal_length_m >= self.focus_distance_m:
+            raise _fault(
+                "#/lens/focal_length_mm",
+                f"A lens of {lens.focal_length_mm:g} mm cannot focus at {self.focus_distance_m:g} m: "
+                "the focal length must be shorter than the focus distance.",
+            )
+        return lens.k_cam_px(self.focus_distance_m, self.image_width_px)
+
+
+K_CAM_EXAMPLE: dict[str, JsonValue] = {
+    "name": "pixel7-wide",
+    "image_width_px": 4080,
+    "image_height_px": 3072,
+    "focus_distance_m": 2.0,
+    "k_cam_px": 1.31,
+    "gamma_px": 0.6,
+}
+LENS_EXAMPLE: dict[str, JsonValue] = {
+    "name": "d200",
+    "image_width_px": 645,
+    "image_height_px": 432,
+    "focus_distance_m": 2.0,
+    "gamma_px": 0.5,
+    "lens": {
+        "focal_length_mm": 35,
+        "f_number": 2.8,
+        "pixel_pitch_um": 6.05,
+        "sensor_width_px": 3872,
+        "k_r": 4.0,
+    },
+}
+
+
+class CameraCreate(CameraSpecs):
+    """A camera to register."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [LENS_EXAMPLE, K_CAM_EXAMPLE]})
+
+    name: Name
+
+
+class CameraReplace(CameraSpecs):
+    """A camera's next revision, whole; what is left out takes its default."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [LENS_EXAMPLE]})
+
+    name: Annotated[Name | None, Field(description="May be left out; a camera cannot be renamed")] = None
+
+    def to_named_draft(self, name: str) -> CameraDraft:
+        """The draft for the camera in the URL; ``BadRequest`` where the body names another."""
+        if self.name is not None and self.name != name:
+            raise _fault("#/name", "The name differs from the URL's: a camera cannot be renamed.")
+        return self.to_draft(name)
+
+
+class RangeRead(BaseModel):
+    """Depths between which 0.25 px of blur error moves the depth by less than 10 %."""
+
+    near: Annotated[float, Field(description="Metres")]
+    far: Annotated[float, Field(description="Metres")]
+
+
+class CameraRead(BaseModel):
+    """A stored camera at its current revision."""
+
+    name: Name
+    description: str | None
+    image_width_px: int
+    image_height_px: int
+    focus_distance_m: float
+    k_cam_px: float
+    gamma_px: float
+    k_r: Annotated[
+        float,
+        Field(description="Diameter of the circle of confusion over its standard deviation, behind k_cam"),
+    ]
+    source: Annotated[Literal["given", "lens", "calibration"], Field(description="Where k_cam came from")]
+    lens: LensSpecs | None
+    intrinsics: PinholeIntrinsics | None
+    fx_px: Annotated[float | None, Field(description="From the intrinsics or the lens, else null")]
+    range_m: RangeRead
+    revision: Annotated[
+        int, Field(description="Grows by one with every change; never used twice under one name")
+    ]
+    created_at: Annotated[datetime, Field(description="UTC")]
+    updated_at: Annotated[datetime, Field(description="UTC")]
+
+    @classmethod
+    def from_record(cls, record: CameraRecord) -> Self:
+        """The stored camera, with what follows from it."""
+        draft, camera = record.draft, record.camera
+        near, far = camera.range_m
+        return cls(
+            name=record.name,
+            description=draft.description,
+            image_width_px=camera.image_width_px,
+            image_height_px=camera.image_height_px,
+            focus_distance_m=camera.focus_distance_m,
+            k_cam_px=camera.k_cam_px,
+            gamma_px=camera.gamma_px,
+            k_r=draft.k_r,
+            source=draft.source,
+            lens=_lens_read(draft.lens),
+            intrinsics=_intrinsics_read(camera.intrinsics),
+            fx_px=_fx_px(draft),
+            range_m=RangeRead(near=near, far=far),
+            revision=record.revision,
+            created_at=record.created_at,
+            updated_at=record.updated_at,
+        )
+
+
+class CameraPage(BaseModel):
+    """Cameras by name."""
+
+    items: list[CameraRead]
+    next_cursor: Annotated[
+        str | None, Field(description="Pass it as `cursor` for the next page; null: the last")
+    ]
+
+
+class CurvePoint(BaseModel):
+    """What the camera shows of a point at one distance."""
+
+    depth_m: float
+    blur_px: Annotated[float, Field(description="Standard deviation of the blur in the image")]
+    defocus_px: Annotated[float, Field(description="The part of it that comes from defocus")]
+    depth_error_m: Annotated[float, Field(description="How far 0.25 px of blur error moves the depth")]
+
+
+class CurveRead(BaseModel):
+    """Blur against distance, at the camera's image size."""
+
+    camera: str
+    revision: int
+    focus_distance_m: float
+    points: list[CurvePoint]
+
+
+def _fault(pointer: str, detail: str) -> BadRequest:
+    return BadRequest(detail, errors=(FieldProblem(pointer, detail),))
+
+
+def _fx_px(draft: CameraDraft) -> float | None:
+    if draft.camera.intrinsics:
+        return draft.camera.intrinsics.fx_px
+    return draft.lens.fx_px(draft.camera.image_width_px) if draft.lens else None
+
+
+def _lens_read(lens: Lens | None) -> LensSpecs | None:
+    if lens is None:
+        return None
+    return LensSpecs(
+        focal_length_mm=lens.focal_length_mm,
+        f_number=lens.f_number,
+        pixel_pitch_um=lens.pixel_pitch_um,
+        sensor_width_px=lens.sensor_width_px,
+        k_r=lens.k_r,
+    )
+
+
+def _intrinsics_read(intrinsics: Intrinsics | None) -> PinholeIntrinsics | None:
+    if intrinsics is None:
+        return None
+    return PinholeIntrinsics(
+        fx_px=intrinsics.fx_px,
+        fy_px=intrinsics.fy_px,
+        cx_px=intrinsics.cx_px,
+        cy_px=intrinsics.cy_px,
+        distortion=list(intrinsics.distortion),
+    )

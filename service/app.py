@@ -1,0 +1,98 @@
+"""The app: routes and middleware at once; database, model and worker only when it starts."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from importlib.metadata import version
+
+from fastapi import FastAPI
+
+from service.api import cameras, depth, handlers, health, metrics, model, openapi, pages
+from service.config import Settings
+from service.inference.artifact import load_model_folder
+from service.inference.estimator import Estimator
+from service.inference.worker import Worker
+from service.middleware import AnswerHead, LimitRequests, ObserveRequests
+from service.storage import schema
+from service.storage.cameras import Cameras
+from service.storage.engine import open_engine
+
+DEPTH_PATH = "/depth"
+DESCRIPTION = """\
+How far away is each pixel of this single photograph, in metres, given the camera that took it?
+Register a camera once, from its k_cam or its lens specs, and send photographs: no training is needed.
+Every error is `application/problem+json`.
+"""
+TAGS = [
+    {"name": "cameras", "description": "What turns blur into metres"},
+    {"name": "depth", "description": "Photographs to depth maps"},
+    {"name": "service", "description": "The model, health and metrics"},
+]
+
+
+def create_app(settings: Settings) -> FastAPI:
+    """The app for these settings; nothing is opened or loaded before it starts."""
+    app = FastAPI(
+        title="camind",
+        version=version("camind"),
+        summary="Metres from one photograph, for any camera",
+        description=DESCRIPTION,
+        openapi_tags=TAGS,
+        license_info={"name": "Apache-2.0", "identifier": "Apache-2.0"},
+        lifespan=_lifespan,
+        redoc_url=None,
+        redirect_slashes=False,
+    )
+    app.state.settings = settings
+    app.state.metrics = metrics.Metrics()
+    _add_middleware(app, settings)
+    handlers.install(app)
+    for part in (cameras, depth, model, health, metrics, pages):
+        app.include_router(part.router)
+    app.openapi = lambda: openapi.describe(app)  # type: ignore[method-assign]
+    return app
+
+
+def _add_middleware(app: FastAPI, settings: Settings) -> None:
+    # the last one added is the outermost
+    app.add_middleware(
+        LimitRequests,
+        max_bytes=settings.max_json_bytes,
+        max_bytes_by_path={DEPTH_PATH: settings.max_image_bytes},
+        deadline_s=settings.receive_deadline_s,
+    )
+    app.add_middleware(AnswerHead)
+    app.add_middleware(ObserveRequests, metrics=app.state.metrics)
+
+
+@asynccontextmanager
+async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
+    await asyncio.to_thread(_start, app)
+    try:
+        yield
+    finally:
+        await asyncio.to_thread(_stop, app)
+
+
+def _start(app: FastAPI) -> None:
+    settings: Settings = app.state.settings
+    engine = open_engine(settings.effective_database_url)
+    if settings.is_database_embedded:
+        schema.upgrade(engine)
+    folder = load_model_folder(settings.model_dir)
+    estimator = Estimator.from_folder(folder, intra_op_threads=settings.threads_per_worker)
+    estimator.warm_up()
+    app.state.engine = engine
+    app.state.cameras = Cameras(engine)
+    app.state.model = folder
+    app.state.estimator = estimator
+    app.state.worker = Worker(
+        slots=settings.worker_slots, queue_size=settings.queue_size, deadline_s=settings.deadline_s
+    )
+    app.state.is_warm = True
+
+
+def _stop(app: FastAPI) -> None:
+    app.state.is_warm = False
+    app.state.worker.close()
+    app.state.engine.dispose()

@@ -1,0 +1,189 @@
+"""Around every request, in pure ASGI: an id, one log event, metrics, limits on what is received, HEAD.
+
+From the outside in: ``ObserveRequests``, ``AnswerHead``, ``LimitRequests``, then the routes.
+"""
+
+import asyncio
+import re
+import time
+from collections.abc import Mapping, MutableMapping
+from dataclasses import dataclass, field
+from urllib.parse import parse_qs
+from uuid import uuid4
+
+import structlog
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.api.metrics import Metrics
+from service.api.problems import problem_response
+from service.errors import CamindError, ReceiveTimeout, TooLarge
+
+REQUEST_ID = "X-Request-Id"
+SANE_REQUEST_ID = re.compile(r"[A-Za-z0-9._:-]{1,128}")
+CLIENT_GONE = 499
+
+log = structlog.stdlib.get_logger("camind.request")
+
+
+@dataclass(slots=True)
+class _Exchange:
+    """What is known of one request by its end."""
+
+    request_id: str
+    started_s: float = field(default_factory=time.perf_counter)
+    status: int | None = None
+
+    def stamp(self, message: Message) -> None:
+        """Note the status, and put the request's id on the answer."""
+        if message["type"] == "http.response.start":
+            self.status = message["status"]
+            MutableHeaders(scope=message)[REQUEST_ID] = self.request_id
+
+
+class ObserveRequests:
+    """Gives every request an id, answers what nothing else caught, counts and logs once."""
+
+    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+        self._app = app
+        self._metrics = metrics
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        exchange = _Exchange(_request_id(scope))
+
+        async def stamped(message: Message) -> None:
+            exchange.stamp(message)
+            await send(message)
+
+        with structlog.contextvars.bound_contextvars(request_id=exchange.request_id):
+            try:
+                with self._metrics.in_progress.track_inprogress():
+                    await self._answered(exchange, scope, receive, stamped)
+            finally:
+                self._report(exchange, scope)
+
+    async def _answered(self, exchange: _Exchange, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await self._app(scope, receive, send)
+        except Exception as exc:
+            if exchange.status is not None:
+                raise
+            if not isinstance(exc, CamindError):
+                log.exception("request_failed")
+                exc = CamindError("Something went wrong here; the log has it under this X-Request-Id.")
+            await problem_response(exc)(scope, receive, send)
+
+    def _report(self, exchange: _Exchange, scope: Scope) -> None:
+        duration_s = time.perf_counter() - exchange.started_s
+        status = exchange.status or CLIENT_GONE
+        path = getattr(scope.get("route"), "path", None)
+        self._metrics.count(scope["method"], path, status, duration_s)
+        log.info(
+            "request",
+            method=scope["method"],
+            path=path,
+            status=status,
+            duration_ms=round(duration_s * 1e3, 1),
+            **_camera(scope, path),
+        )
+
+
+class AnswerHead:
+    """Answers HEAD as GET without the body, as RFC 9110 asks of every server."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or scope["method"] != "HEAD":
+            await self._app(scope, receive, send)
+            return
+
+        async def bodiless(message: Message) -> None:
+            if message["type"] == "http.response.body":
+                message = {**message, "body": b""}
+            await send(message)
+
+        inner = {**scope, "method": "GET"}
+        try:
+            await self._app(inner, receive, bodiless)
+        finally:
+            _hand_back(inner, scope)
+
+
+class LimitRequests:
+    """Refuses bodies that are too large, by their stated length or by what comes, or that come too slowly.
+
+    ``max_bytes_by_path`` overrides ``max_bytes`` for single paths. Raises ``TooLarge``, ``ReceiveTimeout``.
+    """
+
+    def __init__(
+        self, app: ASGIApp, max_bytes: int, max_bytes_by_path: Mapping[str, int], deadline_s: float
+    ) -> None:
+        self._app = app
+        self._max_bytes = max_bytes
+        self._max_bytes_by_path = max_bytes_by_path
+        self._deadline_s = deadline_s
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        limit = self._max_bytes_by_path.get(scope["path"], self._max_bytes)
+        stated = Headers(scope=scope).get("content-length", "")
+        if stated.isdecimal() and int(stated[:20]) > limit:
+            raise _too_large(limit)
+        await self._app(scope, _LimitedBody(receive, limit, self._deadline_s), send)
+
+
+class _LimitedBody:
+    """``receive`` with a count and a clock; both end with the body, for later messages mean a disconnect."""
+
+    def __init__(self, receive: Receive, limit: int, deadline_s: float) -> None:
+        self._receive = receive
+        self._limit = limit
+        self._deadline_s = deadline_s
+        self._ends_at_s = time.monotonic() + deadline_s
+        self._received = 0
+        self._is_whole = False
+
+    async def __call__(self) -> Message:
+        if self._is_whole:
+            return await self._receive()
+        try:
+            async with asyncio.timeout(self._ends_at_s - time.monotonic()):
+                message = await self._receive()
+        except TimeoutError as exc:
+            raise ReceiveTimeout(f"The request body did not arrive within {self._deadline_s:g} s.") from exc
+        self._received += len(message.get("body", b""))
+        self._is_whole = not message.get("more_body", False)
+        if self._received > self._limit:
+            raise _too_large(self._limit)
+        return message
+
+
+def _too_large(limit: int) -> TooLarge:
+    return TooLarge(f"The request body may have at most {limit} bytes.")
+
+
+def _request_id(scope: Scope) -> str:
+    given = Headers(scope=scope).get(REQUEST_ID, "")
+    return given if SANE_REQUEST_ID.fullmatch(given) else uuid4().hex
+
+
+def _camera(scope: Scope, path: str | None) -> dict[str, str]:
+    """The camera a request is about, for the log."""
+    if path and path.startswith("/cameras/"):
+        return {"camera": str(scope["path_params"].get("name", ""))[:64]}
+    names = parse_qs(scope["query_string"].decode("ascii", "replace")).get("camera", [])
+    return {"camera": names[0][:64]} if names else {}
+
+
+def _hand_back(inner: MutableMapping[str, object], scope: Scope) -> None:
+    """Let the outer middleware see which route answered."""
+    for key in ("route", "path_params"):
+        if key in inner:
+            scope[key] = inner[key]
