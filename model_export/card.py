@@ -1,0 +1,55 @@
+"""The model card: what the pair is for, what it was trained on, what it scores. Written, never edited."""
+
+from collections.abc import Mapping
+
+from service.inference.artifact import Interval, Ranges, Training
+
+SCORES_HEADING = "## Scores"
+
+
+def card_text(name: str, ranges: Ranges, training: Training, parameters: int, sources: str) -> str:
+    """Markdown of a model that was not evaluated yet."""
+    return f"""# {name}
+
+Depth in metres from the defocus blur of one photograph, for any camera whose k_cam and gamma are known.
+Two graphs: `blur.onnx` reads blur, `depth.onnx` turns camera-corrected blur into depth. {parameters:,} parameters.
+
+## Use
+
+For static measurements in the range where blur tells distance: a camera's `range_m` says up to where. Every
+pixel has an error (`sigma_m`) and a second hypothesis on the other side of focus. Flat, textureless areas carry
+no blur to read; there the surroundings are continued and the stated error is large. Not for safety functions.
+
+## Trained on
+
+Procedural scenes only: layered surfaces refocused by an occlusion-aware renderer, {training.steps:,} steps.
+Commit `{training.commit}`. Ranges, in pixels of the image that the graphs are given:
+
+| quantity | low | high |
+|---|---|---|
+{_range_rows(ranges)}
+
+Beyond them an answer is a guess and the service says so in its warnings.
+
+## Licence and sources
+
+Weights: Apache-2.0. Textures of the scenes:
+
+{sources.strip() or "none but what the generator draws"}
+
+{SCORES_HEADING}
+
+Not evaluated yet.
+"""
+
+
+def _range_rows(ranges: Ranges) -> str:
+    rows: dict[str, Interval] = {field: getattr(ranges, field) for field in type(ranges).model_fields}
+    return "\n".join(f"| `{name}` | {low:g} | {high:g} |" for name, (low, high) in rows.items())
+
+
+def with_scores(card: str, tables: Mapping[str, str], command: str) -> str:
+    """The card with its scores replaced by Markdown tables, each under its title."""
+    head = card.split(SCORES_HEADING)[0]
+    body = "\n\n".join(f"### {title}\n\n{table}" for title, table in tables.items())
+    return f"{head}{SCORES_HEADING}\n\nPrinted by `{command}`.\n\n{body}\n"

@@ -1,0 +1,57 @@
+"""One config for a training run; it travels inside every checkpoint and the manifest."""
+
+import json
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+Kind = Literal["compact", "paper"]
+
+
+@dataclass(frozen=True, slots=True)
+class SceneConfig:
+    """What the procedural scenes span. Ranges are (low, high); the manifest states them to the service."""
+
+    size_px: int = 160
+    margin_px: int = 32
+    k_cam_px: tuple[float, float] = (0.5, 30.0)
+    gamma_px: tuple[float, float] = (0.3, 1.6)
+    focus_distance_m: tuple[float, float] = (0.2, 5.0)
+    focal_length_px: tuple[float, float] = (150.0, 2500.0)
+    defocus_px: tuple[float, float] = (0.15, 20.0)
+    depth_ratio: tuple[float, float] = (0.15, 8.0)
+    max_layers: int = 6
+    jpeg_quality: tuple[int, int] = (60, 98)
+
+
+@dataclass(frozen=True, slots=True)
+class TrainConfig:
+    """A training run: ``steps`` batches, drawn from a pool that ``fresh_per_step`` new scenes flow through."""
+
+    kind: Kind = "compact"
+    seed: int = 1
+    steps: int = 7_000
+    batch: int = 12
+    learning_rate: float = 2e-3
+    weight_decay: float = 1e-4
+    warmup_steps: int = 200
+    decay_share: float = 0.3
+    clip_norm: float = 1.0
+    b_weight: float = 1.0
+    side_weight: float = 0.1
+    pool: int = 2000
+    fresh_per_step: int = 2
+    checkpoint_every: int = 250
+    scenes: SceneConfig = field(default_factory=SceneConfig)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The config as JSON has it."""
+        values: dict[str, Any] = json.loads(json.dumps(asdict(self)))
+        return values
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> "TrainConfig":
+        """Inverse of ``as_dict``."""
+        scenes: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in values["scenes"].items()
+        }
+        return cls(**{**values, "scenes": SceneConfig(**scenes)})

@@ -1,0 +1,209 @@
+"""A checkpoint to a model folder: blur.onnx, depth.onnx, the model card, and last the manifest."""
+
+import logging
+import subprocess
+import warnings
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import onnx
+import torch
+from torch import Tensor, nn
+
+from model_export.card import card_text
+from model_export.config import SceneConfig, TrainConfig
+from model_export.networks import BLUR_BOUNDS_PX, MULTIPLE, Features, Pair, Scene, parameter_count
+from model_export.train import Checkpoint
+from service.inference.artifact import (
+    CardFile,
+    GraphFile,
+    Graphs,
+    Interval,
+    Manifest,
+    Ranges,
+    TensorSpec,
+    Training,
+    sha256_of,
+    write_manifest,
+)
+
+OPSET = 20
+EXAMPLE_SIZE = (64, 96)
+CARD = "MODEL_CARD.md"
+LICENCES = "LICENCES.md"
+
+Tensors: TypeAlias = "Tensor | tuple[Tensors, ...]"
+
+logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
+
+
+class _BlurGraph(nn.Module):
+    """The blur network with its outputs in the graph's order."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, image: Tensor) -> tuple[Tensor, ...]:
+        out = self.network(image)
+        return (out.blur_px, out.log_error, *out.features)
+
+
+class _DepthGraph(nn.Module):
+    """The depth network with its inputs and outputs in the graph's order."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(
+        self, defocus: Tensor, spread: Tensor, focus: Tensor, focal: Tensor, side: Tensor, features: Features
+    ) -> tuple[Tensor, ...]:
+        out = self.network(defocus, spread, Scene(focus, focal, side), features)
+        return out.log_ratio_near, out.log_ratio_far, torch.sigmoid(out.near_logit), out.log_scale
+
+
+BLUR_OUTPUTS = ("blur_px", "blur_log_error")
+DEPTH_INPUTS = ("relative_defocus", "relative_defocus_spread", "focus_distance_m", "focal_length_px", "side")
+DEPTH_OUTPUTS = ("log_ratio_near", "log_ratio_far", "p_near", "log_scale")
+
+
+def feature_names(count: int) -> tuple[str, ...]:
+    return ("features",) if count == 1 else tuple(f"features_{i}" for i in range(count))
+
+
+def export_graphs(pair: Pair, folder: Path) -> Graphs:
+    """Write both graphs for any batch and any size that is a multiple of 16; what the manifest says of them."""
+    pair.modules().eval()
+    height, width = EXAMPLE_SIZE
+    image = torch.rand(2, 3, height, width)
+    with torch.inference_mode():
+        seen = pair.blur(image)
+    names = feature_names(len(seen.features))
+    cells = (2, 1, height // pair.stride, width // pair.stride)
+    numbers = [torch.ones(2), torch.full((2,), 500.0), torch.zeros(2)]
+    inputs = (torch.rand(cells) + 0.1, torch.rand(cells) + 0.1, *numbers, seen.features)
+    blur = _write(_BlurGraph(pair.blur), (image,), ("image",), BLUR_OUTPUTS + names, folder / "blur.onnx")
+    depth = _write(_DepthGraph(pair.depth), inputs, DEPTH_INPUTS + names, DEPTH_OUTPUTS, folder / "depth.onnx")
+    return Graphs(blur=blur, depth=depth)
+
+
+def _free_sizes(tensors: Tensors) -> Any:
+    """Every input's batch, height and width are free; which sizes belong together is found by tracing."""
+    free = torch.export.Dim.DYNAMIC
+    if isinstance(tensors, Tensor):
+        return {0: free} if tensors.dim() == 1 else {0: free, 2: free, 3: free}
+    return tuple(_free_sizes(tensor) for tensor in tensors)
+
+
+def _flat(tensors: Tensors) -> list[Tensor]:
+    if isinstance(tensors, Tensor):
+        return [tensors]
+    return [flat for tensor in tensors for flat in _flat(tensor)]
+
+
+def _write(
+    graph: nn.Module,
+    inputs: tuple[Tensors, ...],
+    input_names: tuple[str, ...],
+    output_names: tuple[str, ...],
+    path: Path,
+) -> GraphFile:
+    with warnings.catch_warnings():
+        # the exporter steps on its own deprecations
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            graph.eval(),
+            inputs,
+            input_names=input_names,
+            output_names=output_names,
+            dynamic_shapes=_free_sizes(inputs),
+            opset_version=OPSET,
+            dynamo=True,
+            verbose=False,
+        )
+    if program is None:
+        raise RuntimeError("torch.onnx.export gave no program")
+    program.save(path, external_data=False)
+    onnx.checker.check_model(onnx.load(path), full_check=True)
+    with torch.inference_mode():
+        outputs = graph(*inputs)
+    flat = _flat(inputs)
+    return GraphFile(
+        file=path.name,
+        sha256=sha256_of(path),
+        inputs=tuple(map(_spec, input_names, flat)),
+        outputs=tuple(map(_spec, output_names, outputs)),
+    )
+
+
+def _spec(name: str, tensor: Tensor) -> TensorSpec:
+    """Name and shape, with what is free said as ``n``, ``h`` and ``w`` of the image."""
+    if tensor.dim() == 1:
+        return TensorSpec(name=name, shape=("n",))
+    step = EXAMPLE_SIZE[0] // tensor.shape[2]
+    part = "" if step == 1 else f"/{step}"
+    return TensorSpec(name=name, shape=("n", tensor.shape[1], f"h{part}", f"w{part}"))
+
+
+def trained_ranges(scenes: SceneConfig) -> Ranges:
+    """What the scenes spanned, in the manifest's words."""
+    return Ranges(
+        blur_px=Interval(max(scenes.gamma_px[0], BLUR_BOUNDS_PX[0]), scenes.defocus_px[1]),
+        k_cam_px=Interval(*scenes.k_cam_px),
+        focus_distance_m=Interval(*scenes.focus_distance_m),
+        focal_length_px=Interval(*scenes.focal_length_px),
+        gamma_px=Interval(*scenes.gamma_px),
+    )
+
+
+def source_commit() -> str:
+    """The commit of the training code, with ``+`` where the tree differs from it; ``unknown`` outside git."""
+    here = Path(__file__).parent
+    try:
+        head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=True)
+        change = subprocess.run(
+            ["git", "status", "--porcelain", "--", "."], cwd=here, capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return head.stdout.strip() + ("+" if change.stdout.strip() else "")
+
+
+def export_pair(
+    pair: Pair, config: TrainConfig, steps: int, folder: Path, name: str | None = None, sources: str = ""
+) -> Manifest:
+    """Write a whole model folder for a pair; the manifest comes last and vouches for the rest.
+
+    ``sources`` is what the card says of where the training pictures come from and under which licence.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    now = datetime.now(UTC).replace(microsecond=0)
+    name = name or f"camind-{pair.kind}-{now:%Y%m%d}"
+    graphs = export_graphs(pair, folder)
+    ranges = trained_ranges(config.scenes)
+    training = Training(commit=source_commit(), steps=steps, config=config.as_dict())
+    (folder / CARD).write_text(card_text(name, ranges, training, parameter_count(pair), sources))
+    manifest = Manifest(
+        name=name,
+        kind=pair.kind,
+        created_at=now,
+        multiple=MULTIPLE,
+        stride=pair.stride,
+        graphs=graphs,
+        ranges=ranges,
+        scores={},
+        training=training,
+        card=CardFile(file=CARD, sha256=sha256_of(folder / CARD)),
+    )
+    write_manifest(folder, manifest)
+    return manifest
+
+
+def export_checkpoint(checkpoint: Path, textures: Path, folder: Path, name: str | None = None) -> Manifest:
+    """Write the model folder of a checkpoint file; the card carries the licences that lie by the textures."""
+    loaded = Checkpoint.load(checkpoint)
+    licences = textures / LICENCES
+    sources = licences.read_text() if licences.exists() else ""
+    return export_pair(loaded.pair(), loaded.config, loaded.step, folder, name, sources)

@@ -1,0 +1,82 @@
+"""What training minimises: L_depth + b_weight * L_blur (eq. 8), each a likelihood, so that errors are stated."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from model_export.config import TrainConfig
+from model_export.networks import (
+    SPREAD_BOUNDS,
+    BlurEstimate,
+    DepthEstimate,
+    Pair,
+    Scene,
+)
+from service.optics import thin_lens
+
+DEFOCUS_FLOOR_PX = 0.05
+SIDE_VISIBLE_PX = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """Images [n,3,h,w] in 0..1, q - 1 = s1/z - 1 as [n,1,h,w], and per image [n] its camera and side (-1/0/+1)."""
+
+    image: Tensor
+    excess: Tensor
+    k_cam_px: Tensor
+    gamma_px: Tensor
+    focus_distance_m: Tensor
+    focal_length_px: Tensor
+    side: Tensor
+
+    def scene(self) -> Scene:
+        return Scene(self.focus_distance_m, self.focal_length_px, self.side)
+
+
+def laplace(error: Tensor, log_scale: Tensor) -> Tensor:
+    """Negative log-likelihood of an absolute error under a Laplace law with the stated log scale."""
+    return error * torch.exp(-log_scale) + log_scale
+
+
+def correct(blur: BlurEstimate, gamma_px: Tensor, k_cam_px: Tensor, floor_px: float) -> tuple[Tensor, Tensor]:
+    """Relative defocus and its spread from the blur network's answer: what happens between the two graphs."""
+    gamma, k_cam = gamma_px[:, None, None, None], k_cam_px[:, None, None, None]
+    error = torch.exp(blur.log_error).clamp(*SPREAD_BOUNDS)
+    x = thin_lens.relative_defocus_from_blur(blur.blur_px, gamma, k_cam, floor_px)
+    spread = thin_lens.relative_defocus_spread(blur.blur_px, error, gamma, k_cam, floor_px)
+    return x, spread
+
+
+def run_pair(pair: Pair, batch: Batch) -> tuple[BlurEstimate, DepthEstimate]:
+    """Both networks with the camera correction between, in training's differentiable form."""
+    blur: BlurEstimate = pair.blur(batch.image)
+    x, spread = correct(blur, batch.gamma_px, batch.k_cam_px, DEFOCUS_FLOOR_PX)
+    depth: DepthEstimate = pair.depth(x, spread.detach(), batch.scene(), blur.features)
+    return blur, depth
+
+
+def _reduced(excess: Tensor, stride: int) -> Tensor:
+    """Truth at the networks' resolution: one pixel of each cell, since a mean across a depth edge is no depth."""
+    return excess[:, :, ::stride, ::stride]
+
+
+def total_loss(pair: Pair, batch: Batch, config: TrainConfig) -> tuple[Tensor, dict[str, Tensor]]:
+    """The loss of a batch and its parts by name, all float32 scalars."""
+    blur, depth = run_pair(pair, batch)
+    excess = _reduced(batch.excess, pair.stride).float()
+    defocus_px = excess.abs() * batch.k_cam_px[:, None, None, None]
+    true_blur = thin_lens.blur_from_defocus(defocus_px, batch.gamma_px[:, None, None, None])
+    blur_error = (torch.log(blur.blur_px) - torch.log(true_blur)).abs()
+    is_near = (excess > 0).float()
+    log_ratio = torch.where(excess > 0, depth.log_ratio_near, depth.log_ratio_far)
+    depth_error = (log_ratio + torch.log1p(excess)).abs()
+    side_seen = (defocus_px > SIDE_VISIBLE_PX).float()
+    side = functional.binary_cross_entropy_with_logits(depth.near_logit, is_near, weight=side_seen)
+    blur_loss = laplace(blur_error, blur.log_error).mean()
+    depth_loss = laplace(depth_error, depth.log_scale).mean()
+    loss = depth_loss + config.b_weight * blur_loss + config.side_weight * side
+    parts = {"loss": loss, "blur": blur_error.mean(), "depth": depth_error.mean(), "side": side}
+    return loss, {name: part.detach() for name, part in parts.items()}

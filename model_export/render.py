@@ -1,0 +1,183 @@
+"""The occlusion-aware refocuser: sharp layers with depth to the picture a lens would take.
+
+Works in linear light. Every layer's colour is blurred premultiplied with its alpha, and layers are put
+over each other front to back, so a blurred edge of a near object shows what is behind it, a constant
+image stays constant, and no depth edge leaves a halo. Blurring is a product in the frequency domain with
+the exact transfer function of the point spread, so discs of any diameter cost the same.
+"""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from service.optics import thin_lens
+from service.optics.camera import Camera
+
+LEVEL_RATIO = 1.25
+LEVEL_OFFSET_PX = 0.5
+MARGIN_SIGMAS = 3.0
+PIXEL_BOX_VARIANCE = 1.0 / 12.0
+
+
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """A sharp surface: premultiplied linear colour [3,h,w], alpha [1,h,w], defocus sigma [h,w] in px."""
+
+    color: Tensor
+    alpha: Tensor
+    defocus_px: Tensor
+
+
+def transfer(height: int, width: int, sigma_px: float, disc_share: float) -> Tensor:
+    """Transfer function [h, w//2+1] of a point spread with standard deviation ``sigma_px`` per axis.
+
+    ``disc_share`` of the variance is a uniform disc (whose standard deviation is a quarter of its
+    diameter), the rest a Gaussian; 0 is a Gaussian, 1 a sharp disc.
+    """
+    fy = torch.fft.fftfreq(height)[:, None]
+    fx = torch.fft.rfftfreq(width)[None, :]
+    frequency = torch.sqrt(fy * fy + fx * fx)
+    gauss = torch.exp(-2 * math.pi**2 * (1 - disc_share) * sigma_px**2 * frequency**2)
+    if disc_share == 0 or sigma_px == 0:
+        return gauss
+    t = (math.pi * 4 * math.sqrt(disc_share) * sigma_px * frequency).clamp_min(1e-4)
+    disc: Tensor = 2 * torch.special.bessel_j1(t) / t
+    return gauss * disc
+
+
+def blur(image: Tensor, sigma_px: float, disc_share: float = 0.0) -> Tensor:
+    """Blur [..., h, w] by one point spread; the image wraps around, so callers give it a margin."""
+    height, width = image.shape[-2:]
+    spectrum = torch.fft.rfft2(image) * transfer(height, width, sigma_px, disc_share)
+    out: Tensor = torch.fft.irfft2(spectrum, s=(height, width))
+    return out
+
+
+def blur_levels(low_px: float, high_px: float) -> list[float]:
+    """Standard deviations from low to high, close enough for a linear mix of two to pass for one between."""
+    span = math.log((high_px + LEVEL_OFFSET_PX) / (low_px + LEVEL_OFFSET_PX))
+    count = max(1, math.ceil(span / math.log(LEVEL_RATIO))) + 1
+    if high_px - low_px < 0.02:
+        return [(low_px + high_px) / 2]
+    base = low_px + LEVEL_OFFSET_PX
+    return [base * math.exp(span * i / (count - 1)) - LEVEL_OFFSET_PX for i in range(count)]
+
+
+def blur_varying(image: Tensor, sigma_px: Tensor, disc_share: float) -> Tensor:
+    """Blur [c,h,w] by a point spread whose sigma [h,w] varies slowly: levels mixed so that variance is exact."""
+    levels = blur_levels(float(sigma_px.min()), float(sigma_px.max()))
+    if len(levels) == 1:
+        return blur(image, levels[0], disc_share)
+    height, width = image.shape[-2:]
+    spectrum = torch.fft.rfft2(image)
+    variance = sigma_px * sigma_px
+    out = torch.zeros_like(image)
+    for i, level in enumerate(levels):
+        weight = torch.ones_like(variance)
+        if i > 0:
+            below = levels[i - 1] ** 2
+            weight = torch.minimum(weight, (variance - below) / (level**2 - below))
+        if i + 1 < len(levels):
+            above = levels[i + 1] ** 2
+            weight = torch.minimum(weight, (above - variance) / (above - level**2))
+        otf = transfer(height, width, level, disc_share)
+        out += weight.clamp_min(0) * torch.fft.irfft2(spectrum * otf, s=(height, width))
+    return out
+
+
+def composite(layers: Iterable[tuple[Tensor, Tensor]]) -> Tensor:
+    """Put blurred (colour premultiplied [3,h,w], alpha [1,h,w]) over each other, nearest first.
+
+    The last layer must be opaque; what little it lacks is divided out, so a constant stays constant.
+    """
+    image: Tensor | None = None
+    clear: Tensor | None = None
+    for color, alpha in layers:
+        alpha = alpha.clamp(0, 1)
+        image = color if image is None or clear is None else image + clear * color
+        clear = 1 - alpha if clear is None else clear * (1 - alpha)
+    if image is None or clear is None:
+        raise ValueError("nothing to render: no layers")
+    return image / (1 - clear).clamp_min(1e-3)
+
+
+def render_layers(layers: list[Layer], disc_share: float) -> Tensor:
+    """Linear picture [3,h,w] of layers given nearest first; the last one is opaque."""
+
+    def blurred(layer: Layer) -> tuple[Tensor, Tensor]:
+        rgba = torch.cat([layer.color, layer.alpha])
+        out = blur_varying(rgba, layer.defocus_px, disc_share)
+        return out[:3], out[3:]
+
+    return composite(blurred(layer) for layer in layers)
+
+
+def decode_srgb(encoded: NDArray[np.float32]) -> NDArray[np.float32]:
+    """sRGB values in 0..1 to linear light (IEC 61966-2-1)."""
+    low = encoded / 12.92
+    high = ((np.maximum(encoded, 0.04) + 0.055) / 1.055) ** 2.4
+    return np.where(encoded <= 0.04045, low, high).astype(np.float32)
+
+
+def encode_srgb(linear: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Linear light in 0..1 to sRGB values (IEC 61966-2-1)."""
+    clipped = np.clip(linear, 0, 1)
+    high = 1.055 * np.maximum(clipped, 1e-4) ** (1 / 2.4) - 0.055
+    return np.where(clipped <= 0.0031308, clipped * 12.92, high).astype(np.float32)
+
+
+def _slices(defocus_px: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Number the slices of a signed defocus map [h,w], nearest (most negative) 0, steps as ``blur_levels``."""
+    scaled = np.sign(defocus_px) * np.log1p(np.abs(defocus_px) / LEVEL_OFFSET_PX) / math.log(LEVEL_RATIO) * 2
+    index = np.round(scaled).astype(np.int32)
+    return np.unique(index, return_inverse=True)[1].reshape(index.shape).astype(np.int32)
+
+
+def _filled(image: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """The image with every unknown pixel given the colour of the nearest known one."""
+    _, labels = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    colors = np.zeros((int(labels.max()) + 1, 3), np.float32)
+    colors[labels[known]] = image[known]
+    filled: NDArray[np.float32] = colors[labels]
+    return filled
+
+
+def refocus(
+    image: NDArray[np.float32], depth_m: NDArray[np.float32], camera: Camera, disc_share: float = 1.0
+) -> NDArray[np.float32]:
+    """The picture [h,w,3] in 0..1 (sRGB) that ``camera`` would take of a sharp RGB picture with depth [h,w].
+
+    ``depth_m`` is finite and positive everywhere. Depth is sliced; each slice is continued behind what is
+    nearer, with the nearest colour of its own or farther slices, so background shows behind a blurred
+    edge. gamma is applied to the whole picture, less the pixel's own box which the input has already.
+    """
+    signed = thin_lens.signed_defocus(depth_m, camera.focus_distance_m) * camera.k_cam_px
+    sigma = thin_lens.defocus_at_depth(depth_m, camera.focus_distance_m, camera.k_cam_px)
+    margin = math.ceil(MARGIN_SIGMAS * (float(sigma.max()) + camera.gamma_px)) + 1
+    margin = min(margin, min(depth_m.shape) - 1)
+    pad = ((margin, margin), (margin, margin))
+    linear = np.pad(decode_srgb(image), (*pad, (0, 0)), mode="reflect")
+    sigma = np.pad(sigma, pad, mode="reflect")
+    index = np.pad(_slices(signed), pad, mode="reflect")
+
+    def blurred() -> Iterable[tuple[Tensor, Tensor]]:
+        for number in range(int(index.max()) + 1):
+            shown = index <= number
+            color = _filled(linear, index >= number) * shown[..., None]
+            rgba = torch.from_numpy(np.concatenate([color, shown[..., None]], axis=2).astype(np.float32))
+            level = float(sigma[index == number].mean())
+            out = blur(rgba.permute(2, 0, 1), level, disc_share)
+            yield out[:3], out[3:]
+
+    rest = math.sqrt(max(camera.gamma_px**2 - PIXEL_BOX_VARIANCE, 0.0))
+    picture = blur(composite(blurred()), rest)
+    inner = picture[:, margin : -margin or None, margin : -margin or None]
+    return encode_srgb(inner.permute(1, 2, 0).numpy())

@@ -1,0 +1,191 @@
+"""Procedural scenes: layered surfaces with known depth, photographed by a random camera.
+
+A scene is drawn in the inverse depth ratio q = s1 / z, because a plane is linear in it and blur is too:
+sigma = k_cam |q - 1|; q > 1 is nearer than focus, q < 1 beyond.
+"""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from model_export.config import SceneConfig
+from model_export.render import PIXEL_BOX_VARIANCE, Layer, blur, decode_srgb, encode_srgb, render_layers
+from model_export.textures import draw_texture
+from service.optics import thin_lens
+
+SIDES = ("near", "far", "both")
+SIDE_SHARES = (0.45, 0.2, 0.35)
+Map = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """The camera and lens of one scene; ``side`` is -1 if all is nearer than focus, +1 if beyond, 0 if both."""
+
+    k_cam_px: float
+    gamma_px: float
+    focus_distance_m: float
+    focal_length_px: float
+    disc_share: float
+    side: int
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One training example: picture uint8 [3,h,w] (sRGB), q - 1 as float16 [h,w], and the shot."""
+
+    image: NDArray[np.uint8]
+    excess: NDArray[np.float16]
+    shot: Shot
+
+
+def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
+    return math.exp(rng.uniform(math.log(bounds[0]), math.log(bounds[1])))
+
+
+def draw_shot(rng: np.random.Generator, config: SceneConfig) -> Shot:
+    """A random camera, focus distance, lens and side of focus within the config's ranges."""
+    shape = rng.random()
+    disc_share = 0.0 if shape < 0.25 else 1.0 if shape > 0.65 else rng.uniform(0.3, 1.0)
+    side = rng.choice(3, p=SIDE_SHARES)
+    return Shot(
+        k_cam_px=_log_uniform(rng, config.k_cam_px),
+        gamma_px=rng.uniform(*config.gamma_px),
+        focus_distance_m=_log_uniform(rng, config.focus_distance_m),
+        focal_length_px=_log_uniform(rng, config.focal_length_px),
+        disc_share=float(disc_share),
+        side=(-1, 1, 0)[side],
+    )
+
+
+def _excess_bounds(shot: Shot, config: SceneConfig) -> tuple[float, float]:
+    """Lowest and highest q - 1 that the depth range and the largest blur allow."""
+    limit = config.defocus_px[1] / shot.k_cam_px
+    nearest = min(1 / config.depth_ratio[0] - 1, limit)
+    farthest = min(1 - 1 / config.depth_ratio[1], limit)
+    return (0.0 if shot.side < 0 else -farthest), (0.0 if shot.side > 0 else nearest)
+
+
+def _draw_excess(rng: np.random.Generator, shot: Shot, config: SceneConfig) -> float:
+    """q - 1 of one surface: half the time uniform in blur, half log-uniform, on a side the shot has."""
+    low, high = _excess_bounds(shot, config)
+    far = shot.side > 0 or (shot.side == 0 and rng.random() < 0.5)
+    end = -low if far else high
+    first = min(config.defocus_px[0] / shot.k_cam_px, end / 2)
+    amount = rng.uniform(0, end) if rng.random() < 0.5 else _log_uniform(rng, (first, end))
+    return -amount if far else amount
+
+
+def _surface(rng: np.random.Generator, middle: float, bounds: tuple[float, float], size: int) -> Map:
+    """q - 1 over the canvas: a plane through ``middle``, sometimes steep, sometimes curved."""
+    u = np.linspace(-1, 1, size, dtype=np.float32)[None, :]
+    v = u.T
+    steepness = rng.choice([0.0, 0.1, 0.4, 1.0], p=[0.25, 0.3, 0.3, 0.15]) * (abs(middle) + 0.1)
+    angle = rng.uniform(0, 2 * math.pi)
+    surface: Map = middle + steepness * rng.uniform(0.3, 1) * (math.cos(angle) * u + math.sin(angle) * v)
+    if rng.random() < 0.3:
+        waves = rng.uniform(1, 4, 2)
+        surface += 0.3 * steepness * np.sin(waves[0] * u + rng.uniform(0, 6)) * np.cos(waves[1] * v)
+    return np.asarray(np.clip(surface, *bounds), np.float32)
+
+
+def _outline(rng: np.random.Generator, size: int) -> Map:
+    """A random opaque shape [h,w] in 0..1 with smooth edges: polygon, ellipse, blob, or thin bars."""
+    span = 2 * size
+    canvas = np.zeros((span, span), np.uint8)
+    kind = rng.integers(4)
+    center, radius = rng.uniform(0, span, 2), span * rng.uniform(0.08, 0.4)
+    if kind == 0:
+        angles = np.sort(rng.uniform(0, 2 * np.pi, int(rng.integers(3, 8))))
+        corners = center + radius * np.stack([np.cos(angles), np.sin(angles)], 1)
+        cv2.fillPoly(canvas, [corners.astype(np.int32)], 255)
+    elif kind == 1:
+        axes = (int(radius), int(radius * rng.uniform(0.3, 1)))
+        middle = (int(center[0]), int(center[1]))
+        cv2.ellipse(canvas, middle, axes, float(rng.uniform(0, 180)), 0, 360, 255, -1)
+    elif kind == 2:
+        coarse = rng.standard_normal((int(rng.integers(4, 12)),) * 2).astype(np.float32)
+        field = cv2.resize(coarse, (span, span), interpolation=cv2.INTER_CUBIC)
+        canvas = (np.asarray(field) > rng.uniform(0.2, 1.0)).astype(np.uint8) * 255
+    else:
+        for _ in range(int(rng.integers(1, 6))):
+            ends = rng.integers(-50, span + 50, 4).tolist()
+            cv2.line(canvas, (ends[0], ends[1]), (ends[2], ends[3]), 255, int(rng.integers(3, 24)))
+    small = cv2.resize(canvas, (size, size), interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.float32) / np.float32(255)
+
+
+def draw_layers(
+    rng: np.random.Generator, shot: Shot, config: SceneConfig, photographs: list[NDArray[np.uint8]]
+) -> tuple[list[Layer], Map]:
+    """The scene's surfaces, nearest first, and q - 1 of what is seen at each pixel of the canvas."""
+    size = config.size_px + 2 * config.margin_px
+    bounds = _excess_bounds(shot, config)
+    count = int(rng.integers(1, config.max_layers + 1)) if rng.random() < 0.8 else 1
+    middles = sorted((_draw_excess(rng, shot, config) for _ in range(count)), reverse=True)
+    layers: list[Layer] = []
+    seen = np.zeros((size, size), np.float32)
+    covered = np.zeros((size, size), np.bool_)
+    for i, middle in enumerate(middles):
+        alpha = np.ones((size, size), np.float32) if i == count - 1 else _outline(rng, size)
+        excess = _surface(rng, middle, bounds, size)
+        color = decode_srgb(draw_texture(rng, photographs, size)) * alpha[..., None]
+        layers.append(
+            Layer(
+                torch.from_numpy(color.transpose(2, 0, 1).copy()),
+                torch.from_numpy(alpha)[None],
+                torch.from_numpy(np.abs(excess) * np.float32(shot.k_cam_px)),
+            )
+        )
+        shows = (alpha > 0.5) & ~covered
+        seen[shows] = excess[shows]
+        covered |= shows
+    return layers, seen
+
+
+def develop(rng: np.random.Generator, linear: Map, config: SceneConfig) -> NDArray[np.uint8]:
+    """Light on the sensor [h,w,3] to a JPEG's pixels: exposure, noise, white balance, tone, sharpening, JPEG."""
+    picture = linear * rng.uniform(0.5, 1.4) / max(float(np.quantile(linear, 0.98)), 0.2)
+    shot_noise, read_noise = _log_uniform(rng, (1e-4, 1e-2)), _log_uniform(rng, (3e-4, 8e-3))
+    noise = rng.standard_normal(picture.shape).astype(np.float32)
+    spread = rng.uniform(0, 0.9)
+    if spread > 0.3:  # a demosaic makes noise of neighbours alike
+        noise = np.asarray(cv2.GaussianBlur(noise, (0, 0), spread)) * np.float32(1 + 1.5 * spread)
+    picture = picture + noise * np.sqrt(shot_noise * np.maximum(picture, 0) * 0.1 + read_noise**2)
+    picture = picture * rng.uniform(0.85, 1.15, 3)
+    encoded = encode_srgb(picture.astype(np.float32))
+    bend = rng.uniform(-0.1, 0.35)
+    encoded = encoded + bend * (encoded**2 * (3 - 2 * encoded) - encoded)
+    if rng.random() < 0.3:
+        soft = cv2.GaussianBlur(encoded, (0, 0), rng.uniform(0.7, 1.5))
+        encoded = encoded + rng.uniform(0.1, 0.5) * (encoded - soft)
+    pixels = (np.clip(encoded, 0, 1) * 255 + 0.5).astype(np.uint8)
+    if rng.random() < 0.2:
+        return pixels
+    quality = int(rng.integers(config.jpeg_quality[0], config.jpeg_quality[1] + 1))
+    packed = cv2.imencode(".jpg", pixels[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    return np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)[:, :, ::-1]
+
+
+def draw_sample(seed: int, config: SceneConfig, photographs: list[NDArray[np.uint8]]) -> Sample:
+    """The scene of this seed: the same seed, config and photographs give the same sample."""
+    rng = np.random.default_rng(seed)
+    shot = draw_shot(rng, config)
+    layers, seen = draw_layers(rng, shot, config, photographs)
+    linear = render_layers(layers, shot.disc_share)
+    rest = math.sqrt(max(shot.gamma_px**2 - PIXEL_BOX_VARIANCE, 0.0))
+    linear = blur(linear, rest)
+    inner = slice(config.margin_px, config.margin_px + config.size_px)
+    light = np.ascontiguousarray(linear[:, inner, inner].permute(1, 2, 0).numpy())
+    pixels = develop(rng, light, config)
+    return Sample(np.ascontiguousarray(pixels.transpose(2, 0, 1)), seen[inner, inner].astype(np.float16), shot)
+
+
+def true_blur_px(sample: Sample) -> Map:
+    """lambda [h,w] that the sample shows."""
+    defocus = np.abs(sample.excess.astype(np.float32)) * np.float32(sample.shot.k_cam_px)
+    return thin_lens.blur_from_defocus(defocus, sample.shot.gamma_px)

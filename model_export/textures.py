@@ -1,0 +1,131 @@
+"""Sharp textures for scenes: photographs, dead leaves, noise of random slope, text and lines.
+
+Every texture is drawn at twice the size it is wanted and reduced by area, so it is as sharp as pixels allow:
+what blur a scene shows is then the renderer's alone.
+"""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+OVERSAMPLE = 2
+KINDS = ("photo", "leaves", "noise", "drawing")
+KIND_SHARES = (0.5, 0.2, 0.15, 0.15)
+LETTERS = "ABCDEFGHJKLMNPRSTUVXYZabcdefghkmnoprstuvxyz0123456789&%#?"
+
+Image = NDArray[np.float32]
+
+
+def load_photographs(folder: Path) -> list[NDArray[np.uint8]]:
+    """All JPEG and PNG files below ``folder``, RGB, in a fixed order. Raises if there is none."""
+    files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in {".jpg", ".jpeg", ".png"})
+    images = [cv2.imread(str(path), cv2.IMREAD_COLOR) for path in files]
+    photographs = [np.ascontiguousarray(image[:, :, ::-1], np.uint8) for image in images if image is not None]
+    if not photographs:
+        raise FileNotFoundError(f"no JPEG or PNG pictures below {folder}")
+    return photographs
+
+
+def draw_texture(rng: np.random.Generator, photographs: list[NDArray[np.uint8]], size: int) -> Image:
+    """A sharp sRGB texture [size, size, 3] in 0..1 of a random kind."""
+    kind = rng.choice(KINDS, p=KIND_SHARES)
+    if kind == "photo" and photographs:
+        texture = _photo(rng, photographs[rng.integers(len(photographs))], size)
+    elif kind == "leaves":
+        texture = _leaves(rng, size)
+    elif kind == "drawing":
+        texture = _drawing(rng, size)
+    else:
+        texture = _noise(rng, size)
+    return _recolor(rng, texture)
+
+
+def _shrink(image: NDArray[np.uint8], size: int) -> Image:
+    small = cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.float32) / np.float32(255)
+
+
+def _photo(rng: np.random.Generator, photograph: NDArray[np.uint8], size: int) -> Image:
+    """A photograph turned, stretched and mirrored over the canvas, made at least twice as small as it was."""
+    height, width = photograph.shape[:2]
+    canvas = size * OVERSAMPLE
+    zoom = OVERSAMPLE * rng.uniform(0.22, 0.5)
+    if zoom < 0.75:
+        photograph = np.asarray(cv2.resize(photograph, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA), np.uint8)
+        height, width = photograph.shape[:2]
+        zoom = 1.0
+    angle, stretch = rng.uniform(0, 360), rng.uniform(0.7, 1.0)
+    turn = cv2.getRotationMatrix2D((canvas / 2, canvas / 2), angle, zoom)
+    place = np.diag([1.0, stretch, 1.0])
+    place[:2, 2] = rng.uniform(-1, 1, 2) * (width, height)
+    matrix = (np.vstack([turn, [0, 0, 1]]) @ place)[:2]
+    warped = cv2.warpAffine(photograph, matrix, (canvas, canvas), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    return _shrink(np.asarray(warped, np.uint8), size)
+
+
+def _shade(rng: np.random.Generator) -> tuple[int, int, int]:
+    red, green, blue = rng.integers(0, 256, 3).tolist()
+    return red, green, blue
+
+
+def _leaves(rng: np.random.Generator, size: int) -> Image:
+    """Opaque shapes with sizes after a power law, dropped on each other: edges of all sizes, flat areas too."""
+    canvas = np.full((size * OVERSAMPLE, size * OVERSAMPLE, 3), _shade(rng), np.uint8)
+    smallest = rng.uniform(3, 20)
+    largest = rng.uniform(40, 250)
+    for _ in range(int(rng.integers(60, 400))):
+        u = rng.random()
+        radius = (smallest**-1.5 + u * (largest**-1.5 - smallest**-1.5)) ** (-1 / 1.5)
+        center = rng.uniform(0, size * OVERSAMPLE, 2)
+        count = int(rng.integers(3, 9))
+        angles = np.sort(rng.uniform(0, 2 * np.pi, count)) if rng.random() < 0.6 else np.linspace(0, 6, 14)
+        corners = center + radius * np.stack([np.cos(angles), np.sin(angles)], 1)
+        cv2.fillPoly(canvas, [corners.astype(np.int32)], _shade(rng))
+    return _shrink(canvas, size)
+
+
+def _noise(rng: np.random.Generator, size: int) -> Image:
+    """Noise whose amplitude falls as frequency to a random power, per channel partly the same."""
+    frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None, :])
+    amplitude = np.maximum(frequency, 1 / size) ** -rng.uniform(0.4, 1.6)
+    shared = rng.uniform(0.3, 1.0)
+    white = rng.standard_normal((4, size, size))
+    white[:3] = shared * white[3] + (1 - shared) * white[:3]
+    fields = np.fft.irfft2(np.fft.rfft2(white[:3]) * amplitude, s=(size, size))
+    fields /= fields.std() + 1e-6
+    if rng.random() < 0.3:
+        fields = np.tanh(fields * rng.uniform(1, 8))
+    contrast = rng.uniform(0.05, 0.3)
+    return np.clip(0.5 + contrast * fields, 0, 1).transpose(1, 2, 0).astype(np.float32)
+
+
+def _drawing(rng: np.random.Generator, size: int) -> Image:
+    """Text and lines on a plain ground, or a checkerboard: sharp, sparse, much of it flat."""
+    span = size * OVERSAMPLE
+    canvas = np.full((span, span, 3), _shade(rng), np.uint8)
+    if rng.random() < 0.2:
+        cell = int(rng.integers(8, 64))
+        odd = (np.indices((span, span)) // cell).sum(0) % 2 == 1
+        canvas[odd] = _shade(rng)
+        return _shrink(canvas, size)
+    for _ in range(int(rng.integers(10, 60))):
+        x, y = rng.integers(-40, span, 2).tolist()
+        if rng.random() < 0.7:
+            text = "".join(rng.choice(list(LETTERS), int(rng.integers(2, 12))))
+            scale, thickness = float(rng.uniform(0.5, 3.5)), int(rng.integers(1, 7))
+            cv2.putText(canvas, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, scale, _shade(rng), thickness)
+        else:
+            end = rng.integers(-40, span + 40, 2).tolist()
+            cv2.line(canvas, (x, y), (end[0], end[1]), _shade(rng), int(rng.integers(1, 9)))
+    return _shrink(canvas, size)
+
+
+def _recolor(rng: np.random.Generator, texture: Image) -> Image:
+    """Channels swapped, contrast and brightness moved: the same pattern under other paint and light."""
+    out = texture[:, :, rng.permutation(3)]
+    if rng.random() < 0.15:
+        out = np.repeat(out.mean(2, keepdims=True), 3, axis=2)
+    gain, offset = rng.uniform(0.4, 1.1), rng.uniform(0, 0.2)
+    return np.asarray(np.clip(out * gain + offset, 0, 1), np.float32)

@@ -1,0 +1,268 @@
+"""The training loop: scenes flow through a pool, batches are drawn from it, checkpoints resume exactly.
+
+Which scenes are in the pool at a step follows from the step alone, never from timing, so a run with one seed
+is one run, however fast the scene workers are and however often it is stopped.
+"""
+
+import os
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from torch.utils.data import DataLoader, Dataset
+
+from model_export.config import SceneConfig, TrainConfig
+from model_export.losses import Batch, total_loss
+from model_export.networks import Pair, make_pair
+from model_export.scenes import Sample, draw_sample
+from model_export.textures import load_photographs
+
+FOCAL_UNKNOWN_SHARE = 0.3
+SIDE_HINT_SHARE = 0.5
+HELD_OUT_SEED = 2**40
+
+
+class SceneStream(Dataset[Sample]):
+    """Scene number ``start + i`` of a run, drawn in a worker process."""
+
+    def __init__(self, config: TrainConfig, photographs: list[NDArray[np.uint8]], start: int, end: int) -> None:
+        self.config, self.photographs = config, photographs
+        self.start, self.end = start, end
+
+    def __len__(self) -> int:
+        return self.end - self.start
+
+    def __getitem__(self, index: int) -> Sample:
+        seed = self.config.seed * 2**32 + self.start + index
+        return draw_sample(seed, self.config.scenes, self.photographs)
+
+
+def _worker_start(_: int) -> None:
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    os.nice(5)
+
+
+def scene_stream(
+    config: TrainConfig, photographs: list[NDArray[np.uint8]], start: int, end: int, workers: int
+) -> Iterator[Sample]:
+    """Scenes ``start`` to ``end`` in order, drawn ahead by worker processes (0: in this one)."""
+    stream = SceneStream(config, photographs, start, end)
+    ahead = {"prefetch_factor": 64, "multiprocessing_context": "forkserver"} if workers else {}
+    loader: DataLoader[Sample] = DataLoader(
+        stream,
+        batch_size=None,
+        num_workers=workers,
+        worker_init_fn=_worker_start,
+        **ahead,  # type: ignore[arg-type]
+    )
+    return iter(loader)
+
+
+class Pool:
+    """The last ``pool`` scenes of the stream; ``fresh_per_step`` new ones come in before every batch."""
+
+    def __init__(self, config: TrainConfig, photographs: list[NDArray[np.uint8]], step: int, workers: int) -> None:
+        self.config = config
+        first = max(0, self._drawn(step) - config.pool)
+        self.stream = scene_stream(config, photographs, first, self._drawn(config.steps) + 1, workers)
+        self.samples: deque[Sample] = deque(maxlen=config.pool)
+        self.missing = self._drawn(step) - first
+
+    def _drawn(self, step: int) -> int:
+        """How many scenes have come in before ``step``: a few batches first, then the steady flow."""
+        return 4 * self.config.batch + step * self.config.fresh_per_step
+
+    def fill(self) -> Iterator[int]:
+        """Bring the pool to its state at the first step, one scene at a time."""
+        for number in range(self.missing):
+            self.samples.append(next(self.stream))
+            yield number
+
+    def batch(self, step: int) -> Batch:
+        """The batch of a step: scenes, flips, hints and all follow from seed and step."""
+        rng = np.random.default_rng((self.config.seed, step))
+        chosen = [self.samples[i] for i in rng.integers(0, len(self.samples), self.config.batch)]
+        for _ in range(self.config.fresh_per_step):
+            self.samples.append(next(self.stream))
+        return collate(chosen, rng)
+
+
+def collate(samples: list[Sample], rng: np.random.Generator) -> Batch:
+    """Samples to tensors, each flipped and turned at random, focal length and side hint shown or not."""
+    images, excesses, rows = [], [], []
+    for sample in samples:
+        turns, flip = int(rng.integers(4)), int(rng.choice([-1, 1]))
+        images.append(np.rot90(sample.image, turns, (1, 2))[:, :, ::flip].copy())
+        excesses.append(np.rot90(sample.excess, turns)[:, ::flip].astype(np.float32))
+        shot = sample.shot
+        focal = 0.0 if rng.random() < FOCAL_UNKNOWN_SHARE else shot.focal_length_px
+        side = shot.side if rng.random() < SIDE_HINT_SHARE else 0
+        rows.append((shot.k_cam_px, shot.gamma_px, shot.focus_distance_m, focal, side))
+    columns = torch.tensor(rows, dtype=torch.float32).unbind(1)
+    image = torch.from_numpy(np.stack(images)).float() / 255
+    excess = torch.from_numpy(np.stack(excesses))[:, None]
+    return Batch(image.contiguous(memory_format=torch.channels_last), excess, *columns)
+
+
+def held_out(scenes: SceneConfig, photographs: list[NDArray[np.uint8]], count: int) -> Batch:
+    """Scenes of seeds no training draws, as one batch."""
+    samples = [draw_sample(HELD_OUT_SEED + i, scenes, photographs) for i in range(count)]
+    return collate(samples, np.random.default_rng(HELD_OUT_SEED))
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """Everything a run needs to go on, or an export to make files from."""
+
+    config: TrainConfig
+    step: int
+    modules: dict[str, Any]
+    optimizer: dict[str, Any]
+
+    def save(self, path: Path) -> None:
+        """Write whole or not at all."""
+        content = {
+            "config": self.config.as_dict(),
+            "step": self.step,
+            "modules": self.modules,
+            "optimizer": self.optimizer,
+        }
+        scratch = path.with_suffix(".part")
+        torch.save(content, scratch)
+        scratch.replace(path)
+
+    @classmethod
+    def load(cls, path: Path) -> "Checkpoint":
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        config = TrainConfig.from_dict(content["config"])
+        return cls(config, content["step"], content["modules"], content["optimizer"])
+
+    def pair(self) -> Pair:
+        """The networks with this checkpoint's weights, in evaluation mode."""
+        pair = make_pair(self.config.kind)
+        pair.modules().load_state_dict(self.modules)
+        pair.modules().eval()
+        return pair
+
+
+def learning_rate(config: TrainConfig, step: int) -> float:
+    """Warm-up, a level stretch, and a straight fall to nothing over the last ``decay_share`` of the steps."""
+    left = (config.steps - step) / max(1.0, config.steps * config.decay_share)
+    return config.learning_rate * min(1.0, (step + 1) / config.warmup_steps, left)
+
+
+def computes_bfloat16(device: torch.device) -> bool:
+    """Whether the device multiplies bfloat16 itself."""
+    return device.type != "cpu" or torch.cpu._is_avx512_bf16_supported()
+
+
+class Trainer:
+    """Networks, optimiser and step of one run on one device."""
+
+    def __init__(self, config: TrainConfig, device: str, resume: Checkpoint | None = None) -> None:
+        torch.manual_seed(config.seed)
+        self.config, self.device = config, torch.device(device)
+        self.pair = make_pair(config.kind)
+        self.modules = self.pair.modules().to(self.device)
+        self.modules.to(memory_format=torch.channels_last)  # type: ignore[call-overload] # torch's stubs lack it
+        self.optimizer = torch.optim.AdamW(
+            self.modules.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
+        )
+        self.step = 0
+        if resume is not None:
+            self.modules.load_state_dict(resume.modules)
+            self.optimizer.load_state_dict(resume.optimizer)
+            self.step = resume.step
+
+    def autocast(self) -> torch.autocast:
+        """bfloat16 where the hardware computes it; emulated on an older processor it is ten times slower."""
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=computes_bfloat16(self.device))
+
+    def advance(self, batch: Batch) -> dict[str, float]:
+        """One optimiser step on a batch; the loss's parts."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate(self.config, self.step)
+        self.modules.train()
+        with self.autocast():
+            loss, parts = total_loss(self.pair, batch, self.config)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(self.modules.parameters(), self.config.clip_norm)
+        self.optimizer.step()
+        self.step += 1
+        return {name: float(part) for name, part in parts.items()}
+
+    def validate(self, batch: Batch) -> dict[str, float]:
+        """The loss's parts on held-out scenes, networks in evaluation mode."""
+        self.modules.eval()
+        with torch.inference_mode(), self.autocast():
+            _, parts = total_loss(self.pair, batch, self.config)
+        return {name: float(part) for name, part in parts.items()}
+
+    def checkpoint(self) -> Checkpoint:
+        return Checkpoint(self.config, self.step, self.modules.state_dict(), self.optimizer.state_dict())
+
+
+def _progress(console: Console) -> Progress:
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    return Progress(*columns, console=console, speed_estimate_period=300)
+
+
+def train(
+    config: TrainConfig,
+    textures: Path,
+    run: Path,
+    *,
+    workers: int = 1,
+    device: str = "cpu",
+    console: Console | None = None,
+) -> Path:
+    """Train in folder ``run``, going on from its checkpoint if there is one; the path of the last checkpoint."""
+    console = console or Console(stderr=True)
+    photographs = load_photographs(textures)
+    run.mkdir(parents=True, exist_ok=True)
+    path = run / "checkpoint.pt"
+    resume = Checkpoint.load(path) if path.exists() else None
+    trainer = Trainer(config, device, resume)
+    pool = Pool(config, photographs, trainer.step, workers)
+    test = held_out(config.scenes, photographs, 2 * config.batch)
+    with _progress(console) as progress:
+        for _ in progress.track(pool.fill(), total=pool.missing, description="scenes"):
+            pass
+        task = progress.add_task("training", total=config.steps, completed=trainer.step)
+        recent: deque[dict[str, float]] = deque(maxlen=config.checkpoint_every)
+        while trainer.step < config.steps:
+            recent.append(trainer.advance(pool.batch(trainer.step)))
+            progress.update(task, completed=trainer.step)
+            if trainer.step % config.checkpoint_every == 0 or trainer.step == config.steps:
+                trainer.checkpoint().save(path)
+                console.print(_report(trainer.step, recent, trainer.validate(test)))
+    return path
+
+
+def _report(step: int, recent: deque[dict[str, float]], test: dict[str, float]) -> str:
+    mean = {name: sum(parts[name] for parts in recent) / len(recent) for name in test}
+    figures = "  ".join(f"{name} {mean[name]:.3f} (held out {test[name]:.3f})" for name in test)
+    return f"step {step}: {figures}"

@@ -1,0 +1,98 @@
+"""Torch against ONNX Runtime: a model folder answers as its checkpoint does."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import torch
+from numpy.typing import NDArray
+
+from model_export.losses import correct
+from model_export.networks import Pair, Scene
+from model_export.train import Checkpoint
+from service.inference.artifact import load_model_folder
+
+SIZES = ((64, 64), (240, 320), (480, 640))
+TOLERANCE = 1e-3
+SEED = 7
+CAMERA = {"k_cam_px": 3.81, "gamma_px": 0.5, "focus_distance_m": 2.0, "focal_length_px": 550.0}
+
+Arrays = dict[str, NDArray[np.float32]]
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """The largest |onnx - torch| of an output over its largest |torch|, at one image size."""
+
+    height_px: int
+    width_px: int
+    output: str
+    relative: float
+
+
+def verify_pair(pair: Pair, folder: Path) -> list[Difference]:
+    """Compare every output at three sizes; nothing is judged here."""
+    loaded = load_model_folder(folder)
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    providers = ["CPUExecutionProvider"]
+    blur = onnxruntime.InferenceSession(loaded.blur_graph, options, providers=providers)
+    depth = onnxruntime.InferenceSession(loaded.depth_graph, options, providers=providers)
+    differences = []
+    for height, width in SIZES:
+        image = _picture(height, width)
+        expected, feeds = _through_torch(pair, image, loaded.manifest.graphs.feature_names)
+        got = _run(blur, {"image": image}) | _run(depth, feeds)
+        for name, value in expected.items():
+            relative = float(np.abs(got[name] - value).max() / np.abs(value).max())
+            differences.append(Difference(height, width, name, relative))
+    return differences
+
+
+def _picture(height: int, width: int) -> NDArray[np.float32]:
+    """Noise that is smooth in some places and rough in others, so that every band has something to say."""
+    rng = np.random.default_rng(SEED)
+    rough = rng.random((1, 3, height, width), dtype=np.float32)
+    return np.asarray(0.5 + (rough - 0.5) * np.linspace(0.02, 1, width, dtype=np.float32), np.float32)
+
+
+def _run(session: onnxruntime.InferenceSession, feeds: Arrays) -> Arrays:
+    names = [output.name for output in session.get_outputs()]
+    wanted = {entry.name: feeds[entry.name] for entry in session.get_inputs()}
+    return dict(zip(names, session.run(names, wanted), strict=True))
+
+
+def _through_torch(pair: Pair, image: NDArray[np.float32], feature_names: tuple[str, ...]) -> tuple[Arrays, Arrays]:
+    """What torch answers, and what it fed its depth network: both graphs see the same inputs."""
+    one = {name: torch.tensor([value]) for name, value in CAMERA.items()}
+    scene = Scene(one["focus_distance_m"], one["focal_length_px"], torch.zeros(1))
+    pair.modules().eval()
+    with torch.inference_mode():
+        seen = pair.blur(torch.from_numpy(image))
+        x, spread = correct(seen, one["gamma_px"], one["k_cam_px"], 0.0)
+        told = pair.depth(x, spread, scene, seen.features)
+    features = dict(zip(feature_names, (f.numpy() for f in seen.features), strict=True))
+    expected = {
+        "blur_px": seen.blur_px.numpy(),
+        "blur_log_error": seen.log_error.numpy(),
+        "log_ratio_near": told.log_ratio_near.numpy(),
+        "log_ratio_far": told.log_ratio_far.numpy(),
+        "p_near": torch.sigmoid(told.near_logit).numpy(),
+        "log_scale": told.log_scale.numpy(),
+        **features,
+    }
+    feeds = {
+        "relative_defocus": x.numpy(),
+        "relative_defocus_spread": spread.numpy(),
+        "focus_distance_m": scene.focus_distance_m.numpy(),
+        "focal_length_px": scene.focal_length_px.numpy(),
+        "side": scene.side.numpy(),
+        **features,
+    }
+    return expected, feeds
+
+
+def verify_checkpoint(checkpoint: Path, folder: Path) -> list[Difference]:
+    """Compare a model folder with the checkpoint it should have come from."""
+    return verify_pair(Checkpoint.load(checkpoint).pair(), folder)
