@@ -12,7 +12,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from service.errors import BadRequest
+from service.errors import BadRequest, FieldProblem
 from service.inference.depth_map import DepthMap
 from service.inference.preview import render_preview
 from service.opencv import cv2
@@ -20,6 +20,14 @@ from service.opencv import cv2
 MILLIMETRE = 0.001
 LARGEST_MILLIMETRES = 65535
 PERCENTILES = (0, 5, 50, 95, 100)
+MEDIA_TYPES: dict[str, str] = {
+    "png": "image/png",
+    "npy": "application/x-npy",
+    "npz": "application/x-npz",
+    "tiff": "image/tiff",
+    "ply": "application/x-ply",
+    "preview": "image/jpeg",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,14 +74,14 @@ def encode_png(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
         (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP),
     )
     lost = f"{beyond.mean():.1%} of the pixels lie beyond the 65.535 m a 16-bit PNG can hold and read 0"
-    return Encoded(body, "image/png", MILLIMETRE, (lost,) if beyond.any() else ())
+    return Encoded(body, MEDIA_TYPES["png"], MILLIMETRE, (lost,) if beyond.any() else ())
 
 
 def encode_npy(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
     """float32 metres [height, width], NaN where there is no answer."""
     stream = io.BytesIO()
     np.save(stream, answer.depth_m, allow_pickle=False)
-    return Encoded(stream.getvalue(), "application/x-npy")
+    return Encoded(stream.getvalue(), MEDIA_TYPES["npy"])
 
 
 def encode_npz(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
@@ -89,14 +97,14 @@ def encode_npz(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
         valid=answer.valid,
         K=camera_matrix(answer),
     )
-    return Encoded(stream.getvalue(), "application/x-npz")
+    return Encoded(stream.getvalue(), MEDIA_TYPES["npz"])
 
 
 def encode_tiff(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
     """float32 metres, one page, uncompressed; NaN where there is no answer."""
     stream = io.BytesIO()
     tifffile.imwrite(stream, answer.depth_m, photometric="minisblack")
-    return Encoded(stream.getvalue(), "image/tiff")
+    return Encoded(stream.getvalue(), MEDIA_TYPES["tiff"])
 
 
 def encode_ply(answer: DepthMap, rgb: NDArray[np.uint8]) -> Encoded:
@@ -106,7 +114,9 @@ def encode_ply(answer: DepthMap, rgb: NDArray[np.uint8]) -> Encoded:
     """
     matrix = camera_matrix(answer)
     if not np.isfinite(matrix).all():
-        raise BadRequest("points need the camera's intrinsics: register fx_px, fy_px, cx_px and cy_px")
+        raise BadRequest(
+            "A point cloud needs the camera's focal length: register it with intrinsics or lens."
+        )
     v, u = np.nonzero(answer.valid)
     z = answer.depth_m[v, u]
     points = np.empty(
@@ -116,14 +126,14 @@ def encode_ply(answer: DepthMap, rgb: NDArray[np.uint8]) -> Encoded:
     points["y"] = (v - matrix[1, 2]) / matrix[1, 1] * z
     points["z"] = z
     points["red"], points["green"], points["blue"] = rgb[v, u].T
-    return Encoded(_ply_header(len(z)) + points.tobytes(), "application/x-ply")
+    return Encoded(_ply_header(len(z)) + points.tobytes(), MEDIA_TYPES["ply"])
 
 
 def encode_preview(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
     """JPEG in turbo colours, near red and far blue, grey without an answer, with a legend in metres."""
     pixels = render_preview(answer.depth_m)
     body = _written(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), (cv2.IMWRITE_JPEG_QUALITY, 90))
-    return Encoded(body, "image/jpeg")
+    return Encoded(body, MEDIA_TYPES["preview"])
 
 
 ENCODERS: dict[str, Callable[[DepthMap, NDArray[np.uint8]], Encoded]] = {
@@ -152,15 +162,8 @@ def spread_of(answer: DepthMap) -> Spread:
 
 
 def read_point(answer: DepthMap, u: float, v: float) -> PointReading:
-    """The maps at the pixel whose area holds (u, v).
-
-    Raises ``IndexError`` outside [-0.5, width - 0.5) x [-0.5, height - 0.5).
-    """
-    row, column = math.floor(v + 0.5), math.floor(u + 0.5)
-    if not (0 <= row < answer.height_px and 0 <= column < answer.width_px):
-        raise IndexError(
-            f"({u:g}, {v:g}) lies outside a photograph of {answer.width_px}x{answer.height_px} pixels"
-        )
+    """The maps at the pixel whose area holds (u, v); raises ``BadRequest`` outside the photograph."""
+    row, column = pixel_at(u, v, answer.width_px, answer.height_px)
     return PointReading(
         u,
         v,
@@ -171,11 +174,23 @@ def read_point(answer: DepthMap, u: float, v: float) -> PointReading:
     )
 
 
+def pixel_at(u: float, v: float, width_px: int, height_px: int) -> tuple[int, int]:
+    """Row and column of the pixel whose area holds (u, v).
+
+    Raises ``BadRequest`` outside [-0.5, width - 0.5) x [-0.5, height - 0.5).
+    """
+    row, column = math.floor(v + 0.5), math.floor(u + 0.5)
+    if not (0 <= row < height_px and 0 <= column < width_px):
+        detail = f"({u:g}, {v:g}) lies outside the upright photograph of {width_px}x{height_px} pixels."
+        raise BadRequest(detail, errors=(FieldProblem("at", detail),))
+    return row, column
+
+
 def _number_or_none(value: np.float32) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _written(kind: str, pixels: NDArray[np.integer], options: tuple[int, ...]) -> bytes:
+def _written(kind: str, pixels: NDArray[np.integer | np.floating], options: tuple[int, ...]) -> bytes:
     is_written, body = cv2.imencode(kind, pixels, options)
     if not is_written:
         raise RuntimeError(f"OpenCV cannot write {kind}")

@@ -16,8 +16,8 @@ def camera_of(photograph: Photograph, camera: Camera) -> tuple[Camera, tuple[str
     fitting = next((one for one in (turned, camera) if one.is_same_frame(width_px, height_px)), None)
     if fitting is None:
         raise ImageSizeMismatch(
-            f"the photograph has {width_px}x{height_px} pixels upright, the camera "
-            f"{camera.image_width_px}x{camera.image_height_px}: send the whole frame, at any size, not a crop"
+            f"The photograph has {width_px}x{height_px} pixels upright, the camera "
+            f"{camera.image_width_px}x{camera.image_height_px}: send the whole frame, not a crop."
         )
     resized = fitting.resized(width_px, height_px)
     if resized is fitting:

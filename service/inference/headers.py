@@ -22,7 +22,7 @@ JPEG_MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
 JPEG_END, JPEG_SCAN, JPEG_APP1 = 0xD9, 0xDA, 0xE1
 JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 JPEG_BARE = frozenset({0x01, 0xD8, *range(0xD0, 0xD8)})
-TIFF_WIDTH, TIFF_HEIGHT, TIFF_ORIENTATION, TIFF_SAMPLE_FORMAT = 256, 257, 274, 339
+TIFF_WIDTH, TIFF_HEIGHT, TIFF_BITS, TIFF_ORIENTATION, TIFF_SAMPLE_FORMAT = 256, 257, 258, 274, 339
 TIFF_STORES = ((273, 279), (324, 325))
 TIFF_TYPES = {1: "B", 3: "H", 4: "I"}
 TIFF_MAX_VALUES = 1_000_000
@@ -59,21 +59,21 @@ def read_header(data: bytes) -> Header:
     kind = sniff(data)
     parser = PARSERS.get(kind or "")
     if parser is None:
-        raise UnsupportedKind("the bytes are none of JPEG, PNG, TIFF and WebP")
+        raise UnsupportedKind("The bytes are none of JPEG, PNG, TIFF and WebP.")
     try:
         header = parser(data)
     except (struct.error, IndexError) as exc:
         raise cut_off(str(kind)) from exc
     if header.width_px < 1 or header.height_px < 1:
         raise InvalidImage(
-            f"the {header.kind} file states a size of {header.width_px}x{header.height_px} pixels"
+            f"The {header.kind} file states a size of {header.width_px}x{header.height_px} pixels."
         )
     return header
 
 
 def cut_off(kind: str) -> InvalidImage:
     """The error for a file that ends early."""
-    return InvalidImage(f"the {kind} file is cut off: it ends before the picture does")
+    return InvalidImage(f"The {kind} file is cut off: it ends before the picture does.")
 
 
 def _jpeg(data: bytes) -> Header:
@@ -86,7 +86,7 @@ def _jpeg(data: bytes) -> Header:
         elif marker == JPEG_APP1 and payload.startswith(EXIF_SIGNATURE):
             orientation = _exif_orientation(payload[len(EXIF_SIGNATURE) :])
     if size is None:
-        raise InvalidImage("the jpeg file holds no picture")
+        raise InvalidImage("The jpeg file holds no picture.")
     return Header("jpeg", *size, orientation)
 
 
@@ -97,7 +97,7 @@ def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
         while data[at] == 0xFF and data[at + 1] == 0xFF:
             at += 1
         if data[at] != 0xFF:
-            raise InvalidImage("the jpeg file is damaged: no marker where one must be")
+            raise InvalidImage("The jpeg file is damaged: no marker where one must be.")
         marker, at = data[at + 1], at + 2
         if marker == JPEG_END:
             return
@@ -134,7 +134,7 @@ def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
         (checksum,) = struct.unpack_from(">I", data, end)
         if zlib.crc32(memoryview(data)[at + 4 : end]) != checksum:
             raise InvalidImage(
-                f"the png file is damaged: its {name.decode('latin-1')!r} part fails its checksum"
+                f"The png file is damaged: its {name.decode('latin-1')!r} part fails its checksum."
             )
         yield name, data[at + 8 : end] if name in (b"IHDR", b"eXIf") else b""
         at = end + 4
@@ -154,7 +154,7 @@ def _webp(data: bytes) -> Header:
             orientation = _exif_orientation(data[at + 8 : at + 8 + chunk].removeprefix(EXIF_SIGNATURE))
         at += 8 + chunk + chunk % 2
     if size is None:
-        raise InvalidImage("the webp file holds no picture")
+        raise InvalidImage("The webp file holds no picture.")
     return Header("webp", *size, orientation)
 
 
@@ -177,7 +177,9 @@ def _tiff(data: bytes) -> Header:
         if any(offset + count > len(data) for offset, count in stored):
             raise cut_off("tiff")
     if 3 in directory.values(TIFF_SAMPLE_FORMAT):
-        raise UnsupportedKind("a tiff of floating-point numbers is no photograph: send 8 or 16 bits, sRGB")
+        raise UnsupportedKind("A tiff of floating-point numbers is no photograph: send 8 or 16 bits, sRGB.")
+    if not set(directory.values(TIFF_BITS)) <= {8, 16}:
+        raise UnsupportedKind("A tiff must have 8 or 16 bits a channel.")
     width, height = (next(iter(directory.values(tag)), 0) for tag in (TIFF_WIDTH, TIFF_HEIGHT))
     at = directory.offset_of(TIFF_ORIENTATION)
     return Header("tiff", width, height, directory.orientation(), at)
@@ -196,7 +198,7 @@ class _TiffDirectory:
 
     def __init__(self, data: bytes) -> None:
         if data[:4] not in (b"II*\x00", b"MM\x00*"):
-            raise InvalidImage("the file has no TIFF header")
+            raise InvalidImage("The file has no TIFF header.")
         self._data = data
         self._order = "<" if data[:2] == b"II" else ">"
         (start,) = self._unpack("I", 4)
@@ -224,7 +226,7 @@ class _TiffDirectory:
         if kind not in TIFF_TYPES:
             return ()
         if count > TIFF_MAX_VALUES:
-            raise InvalidImage(f"the tiff file states {count} values for tag {tag}")
+            raise InvalidImage(f"The tiff file states {count} values for tag {tag}.")
         return self._unpack(f"{count}{TIFF_TYPES[kind]}", at)
 
     def orientation(self) -> int:

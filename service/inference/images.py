@@ -35,7 +35,8 @@ TURNS: dict[int, tuple[bool, bool, bool]] = {
     7: (True, True, True),
     8: (True, False, True),
 }
-DECODE_FLAGS = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+# not IMREAD_COLOR_RGB: OpenCV 5.0 leaves a 16-bit TIFF read so uninitialised
+DECODE_FLAGS = cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,14 +76,14 @@ def read_photograph(
     (a declared type or bytes that are not listed).
     """
     limits = limits or ImageLimits()
-    declared = _declared_kind(media_type)
+    declared = declared_kind(media_type)
     if not data:
-        raise InvalidImage("the body is empty: send the bytes of one photograph")
+        raise InvalidImage("The body is empty: send the bytes of one photograph.")
     if len(data) > limits.max_bytes:
-        raise TooLarge(f"the file has {len(data)} bytes, more than the {limits.max_bytes} accepted")
+        raise TooLarge(f"The file has {len(data)} bytes, more than the {limits.max_bytes} accepted.")
     kind = sniff(data)
     if kind is None:
-        raise UnsupportedKind("the bytes are none of JPEG, PNG, TIFF, WebP and HEIC")
+        raise UnsupportedKind("The bytes are none of JPEG, PNG, TIFF, WebP and HEIC.")
     stored, orientation = _decode_heic(data, limits) if kind == "heic" else _decode(data, limits)
     warnings = (f"declared {media_type}, read as {kind}",) if declared not in (None, kind) else ()
     height, width = stored.shape[:2]
@@ -101,19 +102,20 @@ def turned(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
     return np.ascontiguousarray(pixels)
 
 
-def _declared_kind(media_type: str | None) -> Kind | None:
+def declared_kind(media_type: str | None) -> Kind | None:
+    """The kind a media type names, None where it names none; ``UnsupportedKind`` for one not listed."""
     name = (media_type or "").partition(";")[0].strip().lower()
     if name in UNDECLARED:
         return None
     if name not in MEDIA_TYPES:
-        raise UnsupportedKind(f"{name} is no photograph: send one of {', '.join(MEDIA_TYPES)}")
+        raise UnsupportedKind(f"{name[:100]} is no photograph: send one of {', '.join(MEDIA_TYPES)}.")
     return MEDIA_TYPES[name]
 
 
 def _require_pixels(width_px: int, height_px: int, limits: ImageLimits) -> None:
     most = min(limits.max_pixels, PIXEL_CEILING)
     if width_px * height_px > most:
-        raise TooLarge(f"the picture has {width_px}x{height_px} pixels, more than the {most} accepted")
+        raise TooLarge(f"The picture has {width_px}x{height_px} pixels, more than the {most} accepted.")
 
 
 def _decode(data: bytes, limits: ImageLimits) -> tuple[NDArray[np.uint8], int]:
@@ -122,10 +124,11 @@ def _decode(data: bytes, limits: ImageLimits) -> tuple[NDArray[np.uint8], int]:
     try:
         pixels = cv2.imdecode(np.frombuffer(_unturned(data, header), np.uint8), DECODE_FLAGS)
     except cv2.error as exc:
-        raise InvalidImage(f"the {header.kind} file cannot be decoded: it is damaged") from exc
+        raise InvalidImage(f"The {header.kind} file cannot be decoded: it is damaged.") from exc
     if pixels is None or pixels.shape[:2] != (header.height_px, header.width_px):
-        raise InvalidImage(f"the {header.kind} file cannot be decoded: it is damaged or of an unusual form")
-    return _eight_bits(pixels), header.orientation
+        raise InvalidImage(f"The {header.kind} file cannot be decoded: it is damaged or of an unusual form.")
+    rgb = cv2.cvtColor(_eight_bits(pixels), cv2.COLOR_BGR2RGB)
+    return np.asarray(rgb, np.uint8), header.orientation
 
 
 def _unturned(data: bytes, header: Header) -> bytes:
@@ -142,7 +145,7 @@ def _eight_bits(pixels: NDArray[Any]) -> NDArray[np.uint8]:
     if pixels.dtype == np.uint16:
         pixels = cv2.convertScaleAbs(pixels, alpha=1 / 257)
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
-        raise InvalidImage(f"pixels of type {pixels.dtype} are not supported: send 8 or 16 bits a channel")
+        raise InvalidImage(f"Pixels of type {pixels.dtype} are not supported: send 8 or 16 bits a channel.")
     return np.asarray(pixels, np.uint8)
 
 
@@ -151,12 +154,12 @@ def _decode_heic(data: bytes, limits: ImageLimits) -> tuple[NDArray[np.uint8], i
     try:
         import pi_heif
     except ImportError as exc:
-        raise UnsupportedKind("HEIC needs the service's extra 'heic': send JPEG instead") from exc
+        raise UnsupportedKind("HEIC needs the service's extra 'heic': send JPEG instead.") from exc
     try:
         picture = pi_heif.open_heif(data, convert_hdr_to_8bit=True)
         width_px, height_px = picture.size
         _require_pixels(width_px, height_px, limits)
         pixels = np.asarray(picture)
     except (ValueError, EOFError, RuntimeError, SyntaxError, OSError) as exc:
-        raise InvalidImage("the heic file cannot be decoded: it is cut off or damaged") from exc
+        raise InvalidImage("The heic file cannot be decoded: it is cut off or damaged.") from exc
     return _eight_bits(pixels[..., :3]), 1

@@ -1,7 +1,7 @@
 """Large photographs in overlapping tiles, so that memory follows the tile and not the photograph."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,17 +57,22 @@ def spans(size: int, side: int, multiple: int) -> list[Span]:
     return [Span(start, min(start + side, size)) for start in starts[:-1]] + [Span(starts[-1], size)]
 
 
-def fades(along: list[Span], stride: int) -> Iterator[NDArray[np.float32]]:
-    """A weight per map pixel of each span: 1 where it is alone, and 1 in sum over neighbours' overlaps."""
+def fades(along: list[Span], stride: int) -> list[NDArray[np.float32]]:
+    """A weight per map pixel of each span: it falls towards neighbours, and all sum to 1 everywhere."""
+    total = np.zeros(-(-along[-1].stop // stride))
+    weights = []
     for place, span in enumerate(along):
         centres = np.arange(span.start // stride, -(-span.stop // stride)) * stride + stride / 2
         weight = np.ones(len(centres))
         if place:
             weight *= np.clip((centres - span.start) / (along[place - 1].stop - span.start), 0, 1)
         if place + 1 < len(along):
-            following = along[place + 1].start
-            weight *= np.clip((span.stop - centres) / (span.stop - following), 0, 1)
-        yield weight.astype(np.float32)
+            weight *= np.clip((span.stop - centres) / (span.stop - along[place + 1].start), 0, 1)
+        first = span.start // stride
+        total[first : first + len(weight)] += weight
+        weights.append((first, weight))
+    # three spans may share a pixel where the photograph is little larger than two
+    return [(weight / total[first : first + len(weight)]).astype(np.float32) for first, weight in weights]
 
 
 class _Merge:

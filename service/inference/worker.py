@@ -65,11 +65,11 @@ class Worker:
             if not deadline.expired():
                 raise
             raise Busy(
-                f"no answer within {self.deadline_s:g} s: try again later or send a smaller photograph",
+                f"No answer within {self.deadline_s:g} s: try again later or send a smaller photograph.",
                 retry_after_s=self._retry_after_s(),
             ) from exc
         except Cancelled as exc:
-            raise Busy("the service is stopping") from exc
+            raise Busy("The service is stopping.") from exc
         finally:
             cancellation.cancel()
 
@@ -84,7 +84,7 @@ class Worker:
         with self._lock:
             if len(self._live) >= self.slots + self.queue_size:
                 raise Busy(
-                    f"{len(self._live)} requests are running or queued, which is all there is room for",
+                    f"{len(self._live)} requests run or wait, with room for no more: try again later.",
                     retry_after_s=self._retry_after_s(),
                 )
             self._live.add(cancellation)
@@ -104,7 +104,7 @@ class Worker:
             future = self._pool.submit(timed)
         except RuntimeError as exc:
             self._live.discard(cancellation)
-            raise Busy("the service is stopping") from exc
+            raise Busy("The service is stopping.") from exc
         future.add_done_callback(lambda _: self._live.discard(cancellation))
         return future
 

@@ -110,9 +110,7 @@ class Camera:
     @property
     def range_m(self) -> tuple[float, float]:
         """Nearest and farthest depth where 0.25 px of blur error moves the depth by less than 10 %."""
-        far = thin_lens.farthest_depth(
-            self.focus_distance_m, self.k_cam_px, RANGE_BLUR_ERROR_PX, RANGE_DEPTH_ERROR
-        )
+        far = thin_lens.farthest_depth(self.focus_distance_m, self.k_cam_px, RANGE_BLUR_ERROR_PX, RANGE_DEPTH_ERROR)
         return min(self.focal_length_m or 0.0, far), far
 
     def is_same_frame(self, width_px: int, height_px: int) -> bool:
@@ -156,6 +154,12 @@ class Camera:
             self.k_cam_px, self.focal_length_m or 0.0, self.focus_distance_m, focus_distance_m
         )
         return replace(self, k_cam_px=k_cam_px, focus_distance_m=focus_distance_m)
+
+    def seen_through(self, lens: Lens) -> "Camera":
+        """The same camera with the intrinsics its lens implies: square pixels, the axis in the middle."""
+        fx_px = lens.fx_px(self.image_width_px)
+        centre = ((self.image_width_px - 1) / 2, (self.image_height_px - 1) / 2)
+        return replace(self, intrinsics=Intrinsics(fx_px, fx_px, *centre))
 
     def blur_px(self, depth_m: float) -> float:
         """lambda this camera shows at a depth."""

@@ -86,9 +86,7 @@ def _manifest(folder: Path, stride: int, blur_range: Interval) -> Manifest:
 
 def _graph_file(path: Path) -> GraphFile:
     graph = onnx.load(path).graph
-    return GraphFile(
-        file=path.name, sha256=sha256_of(path), inputs=_specs(graph.input), outputs=_specs(graph.output)
-    )
+    return GraphFile(file=path.name, sha256=sha256_of(path), inputs=_specs(graph.input), outputs=_specs(graph.output))
 
 
 def _specs(values: Any) -> tuple[TensorSpec, ...]:

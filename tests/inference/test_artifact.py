@@ -60,9 +60,7 @@ def test_a_missing_file_is_refused_by_name(folder: Path, name: str) -> None:
         ({"card": {"file": "/etc/passwd", "sha256": "0" * 64}}, "card.file"),
     ],
 )
-def test_a_manifest_that_breaks_the_schema_is_refused(
-    folder: Path, change: dict[str, Any], fault: str
-) -> None:
+def test_a_manifest_that_breaks_the_schema_is_refused(folder: Path, change: dict[str, Any], fault: str) -> None:
     edit(folder, change)
     with pytest.raises(ModelFolderError, match=fault):
         load_model_folder(folder)

@@ -1,0 +1,91 @@
+"""What ``POST /depth`` can be asked, and its answer in numbers."""
+
+import re
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from service.inference.pair import Side
+
+MAX_POINTS = 1000
+POINT = re.compile(r"(-?\d{1,6}(?:\.\d{1,6})?),(-?\d{1,6}(?:\.\d{1,6})?)")
+
+
+def _require_point(value: str) -> str:
+    if not POINT.fullmatch(value):
+        raise ValueError("a point is two numbers of pixels, u,v: for instance 320,216")
+    return value
+
+
+Point = Annotated[str, AfterValidator(_require_point)]
+
+
+class DepthQuery(BaseModel):
+    """What can be asked of a photograph."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    camera: Annotated[str, Field(min_length=1, max_length=200, description="Name of the camera that took it")]
+    side: Annotated[
+        Side, Field(description="Where everything is: nearer than the plane in focus, beyond it, or unknown")
+    ] = "auto"
+    format: Annotated[
+        Literal["png", "npy", "npz", "tiff", "ply", "preview", "json"] | None,
+        Field(description="Form of the answer; wins over Accept. Default png"),
+    ] = None
+    at: Annotated[
+        tuple[Point, ...],
+        Field(max_length=MAX_POINTS, description="Pixels u,v to read, repeatable; answered in json"),
+    ] = ()
+    focus_distance_m: Annotated[
+        float | None,
+        Field(gt=0, allow_inf_nan=False, description="This shot's focus distance, if not the camera's"),
+    ] = None
+
+    @property
+    def points(self) -> list[tuple[float, float]]:
+        """The pixels asked for, (u, v)."""
+        return [(_number(u), _number(v)) for u, v in (text.split(",") for text in self.at)]
+
+
+class SpreadRead(BaseModel):
+    """Depth over the pixels with an answer, in metres; null without one."""
+
+    model_config = ConfigDict(from_attributes=True)
+
+    min: float | None
+    p5: float | None
+    median: float | None
+    p95: float | None
+    max: float | None
+
+
+class PointRead(BaseModel):
+    """Depth at one pixel: metres along the optical axis, one standard deviation, and the other hypothesis."""
+
+    model_config = ConfigDict(from_attributes=True)
+
+    u: int | float
+    v: int | float
+    depth_m: float | None
+    depth_alt_m: float | None
+    sigma_m: float | None
+    p_near: Annotated[float, Field(ge=0, le=1)]
+
+
+class DepthRead(BaseModel):
+    """The answer to a photograph in numbers."""
+
+    camera: str
+    revision: int
+    model: str
+    width_px: int
+    height_px: int
+    depth_m: SpreadRead
+    valid_fraction: Annotated[float, Field(ge=0, le=1)]
+    points: list[PointRead]
+    warnings: list[str]
+
+
+def _number(text: str) -> float:
+    return float(text) if "." in text else int(text)

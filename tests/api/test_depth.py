@@ -1,0 +1,372 @@
+"""``POST /depth`` end to end: a photograph in, metres out in every form, a clear no to all else."""
+
+import asyncio
+import io
+import json
+import os
+import threading
+import time
+from collections.abc import MutableMapping
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from fastapi import FastAPI
+from httpx2 import Response
+from numpy.typing import NDArray
+from starlette.testclient import TestClient
+
+from service.config import Settings
+from service.inference.cancellation import Cancellation
+from service.inference.encode import MEDIA_TYPES
+from service.inference.worker import Worker
+from service.opencv import cv2
+from service.optics import thin_lens
+from tests.inference.oracle_pair import blur_of
+from tests.inference.photographs import corners, hostile_png, jpeg, png, tiff, webp
+
+CAMERA = {
+    "name": "bench",
+    "image_width_px": 96,
+    "image_height_px": 64,
+    "focus_distance_m": 2.0,
+    "k_cam_px": 6.0,
+    "gamma_px": 0.5,
+    "intrinsics": {"fx_px": 300.0, "fy_px": 300.0, "cx_px": 40.0, "cy_px": 30.0},
+}
+LEVEL = 90
+PROBLEM = "application/problem+json"
+
+
+def depth_near(level: int, k_cam_px: float = 6.0, gamma_px: float = 0.5, focus_m: float = 2.0) -> float:
+    """What the model folder of these tests must answer on the near side for a grey level."""
+    x = thin_lens.relative_defocus_from_blur(blur_of(level), gamma_px, k_cam_px)
+    return thin_lens.depth_near(x, focus_m)
+
+
+def grey(level: int = LEVEL, height: int = 64, width: int = 96) -> NDArray[np.uint8]:
+    return np.full((height, width, 3), level, np.uint8)
+
+
+@pytest.fixture
+def bench(client: TestClient) -> TestClient:
+    """The running app with a camera for these photographs."""
+    assert client.post("/cameras", json=CAMERA).status_code == 201
+    return client
+
+
+def ask(client: TestClient, body: bytes | None = None, headers: dict[str, str] | None = None, **query: Any) -> Response:
+    """Post a photograph (a grey PNG unless given) taken by the camera of these tests."""
+    content = png(grey()) if body is None else body
+    parameters = {"camera": "bench", "side": "near"} | query
+    given = {name: value for name, value in parameters.items() if value is not None}
+    return client.post("/depth", params=given, content=content, headers={"Content-Type": "image/png"} | (headers or {}))
+
+
+def refused(response: Response, status: int, *words: str) -> dict[str, Any]:
+    """The problem of a response that must have this status, and these words in its detail."""
+    assert response.status_code == status, response.text
+    assert response.headers["content-type"] == PROBLEM
+    problem: dict[str, Any] = response.json()
+    assert problem["status"] == status
+    for word in words:
+        assert word in json.dumps(problem), problem
+    return problem
+
+
+def npy(response: Response) -> NDArray[np.float32]:
+    assert response.status_code == 200, response.text
+    return np.asarray(np.load(io.BytesIO(response.content), allow_pickle=False), np.float32)
+
+
+def test_the_default_is_a_16_bit_png_in_millimetres_with_all_headers(bench: TestClient) -> None:
+    response = ask(bench)
+    assert response.status_code == 200, response.text
+    assert response.headers["content-type"] == "image/png"
+    pixels = cv2.imdecode(np.frombuffer(response.content, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert pixels is not None
+    assert pixels.dtype == np.uint16
+    assert pixels.shape == (64, 96)
+    np.testing.assert_allclose(pixels * 0.001, depth_near(LEVEL), atol=0.001)
+    assert response.headers["Camind-Camera"] == "bench"
+    assert response.headers["Camind-Camera-Revision"] == "1"
+    assert response.headers["Camind-Model"] == "oracle-20260101"
+    assert float(response.headers["Camind-Depth-Scale-M"]) == 0.001
+    assert response.headers["Camind-Warnings"] == ""
+    stages = dict(stage.split(";dur=") for stage in response.headers["Server-Timing"].split(", "))
+    assert list(stages) == ["decode", "wait", "blur", "correct", "depth", "encode"]
+    assert all(float(spent) >= 0 for spent in stages.values())
+
+
+def test_every_format_tells_the_same_metres(bench: TestClient) -> None:
+    want = depth_near(LEVEL)
+    np.testing.assert_allclose(npy(ask(bench, format="npy")), want, rtol=1e-3)
+    with np.load(io.BytesIO(ask(bench, format="npz").content)) as stored:
+        np.testing.assert_allclose(stored["depth_m"], want, rtol=1e-3)
+        np.testing.assert_array_equal(stored["K"], [[300, 0, 40], [0, 300, 30], [0, 0, 1]])
+    floats = tifffile.imread(io.BytesIO(ask(bench, format="tiff").content))
+    np.testing.assert_allclose(floats, want, rtol=1e-3)
+    assert b"element vertex 6144" in ask(bench, format="ply").content
+    assert ask(bench, format="preview").content.startswith(b"\xff\xd8\xff")
+    assert ask(bench, format="json").json()["depth_m"]["median"] == pytest.approx(want, rel=1e-3)
+    for name, media_type in MEDIA_TYPES.items():
+        response = ask(bench, format=name)
+        assert response.headers["content-type"] == media_type
+        assert float(response.headers["Camind-Depth-Scale-M"]) == (0.001 if name == "png" else 1)
+
+
+def test_json_has_exactly_the_numbers_of_the_design(bench: TestClient) -> None:
+    answer = ask(bench, format="json", at=["12,7", "95.4,0"]).json()
+    assert set(answer) == {
+        *("camera", "revision", "model", "width_px", "height_px", "depth_m"),
+        *("valid_fraction", "points", "warnings"),
+    }
+    assert set(answer["depth_m"]) == {"min", "p5", "median", "p95", "max"}
+    assert (answer["width_px"], answer["height_px"], answer["valid_fraction"]) == (96, 64, 1.0)
+    point, other = answer["points"]
+    assert set(point) == {"u", "v", "depth_m", "depth_alt_m", "sigma_m", "p_near"}
+    assert (point["u"], point["v"], other["u"]) == (12, 7, 95.4)
+    assert point["depth_m"] == pytest.approx(depth_near(LEVEL), rel=1e-3)
+    assert point["depth_alt_m"] > 2 > point["depth_m"]
+    assert point["p_near"] == 1
+    assert point["sigma_m"] > 0
+
+
+def test_json_says_null_and_never_nan(bench: TestClient) -> None:
+    response = ask(bench, png(grey(230)), format="json", at="3,3", side="auto")
+    assert b"NaN" not in response.content
+    assert response.json()["points"][0]["depth_alt_m"] is None
+
+
+@pytest.mark.parametrize(
+    ("accept", "kind"),
+    [
+        ("*/*", "image/png"),
+        ("image/*", "image/png"),
+        ("application/json", "application/json"),
+        ("image/png;q=0.5, application/x-npy", "application/x-npy"),
+        ("image/jpeg;q=0.9, image/png;q=0.8", "image/jpeg"),
+        ("image/png;q=0, */*;q=0.1", "application/x-npy"),
+        ("text/html, application/xhtml+xml, */*;q=0.8", "image/png"),
+        ("APPLICATION/JSON; q=1.0", "application/json"),
+    ],
+)
+def test_accept_chooses_the_form(bench: TestClient, accept: str, kind: str) -> None:
+    response = ask(bench, headers={"Accept": accept})
+    assert response.headers["content-type"] == kind
+    assert "Accept" in response.headers["vary"]
+
+
+def test_format_wins_over_accept(bench: TestClient) -> None:
+    response = ask(bench, headers={"Accept": "image/png"}, format="json")
+    assert response.headers["content-type"] == "application/json"
+
+
+@pytest.mark.parametrize("accept", ["text/csv", "image/gif, video/*", "image/png;q=0"])
+def test_an_accept_that_nothing_fits_is_406(bench: TestClient, accept: str) -> None:
+    refused(ask(bench, headers={"Accept": accept}), 406, "image/png", "application/json")
+
+
+def test_side_forces_the_answer_and_the_probability(bench: TestClient) -> None:
+    near = ask(bench, format="json", at="9,9", side="near").json()["points"][0]
+    far = ask(bench, format="json", at="9,9", side="far").json()["points"][0]
+    assert (near["p_near"], far["p_near"]) == (1, 0)
+    assert near["depth_m"] == pytest.approx(far["depth_alt_m"])
+    assert near["depth_m"] < 2 < far["depth_m"]
+
+
+def test_a_form_field_is_as_good_as_the_body(bench: TestClient) -> None:
+    for name, data, kind in (("a.jpg", jpeg(grey()), "image/jpeg"), ("a", png(grey()), "")):
+        files = {"image": (name, data, kind)} if kind else {"image": (name, data)}
+        response = bench.post("/depth?camera=bench&side=near&format=npy", files=files)
+        np.testing.assert_allclose(npy(response), depth_near(LEVEL), rtol=0.01)
+
+
+@pytest.mark.parametrize("make", [jpeg, png, webp, tiff])
+def test_every_kind_of_photograph_is_taken(bench: TestClient, make: Any) -> None:
+    kind = f"image/{make.__name__}"
+    response = ask(bench, make(grey()), {"Content-Type": kind}, format="npy")
+    np.testing.assert_allclose(npy(response), depth_near(LEVEL), rtol=0.01)
+
+
+def test_an_upright_phone_photograph_is_answered_upright(bench: TestClient) -> None:
+    stored = grey(30)
+    stored[:, :48] = 120
+    response = ask(bench, png(stored, 6), format="npz")
+    with np.load(io.BytesIO(response.content)) as found:
+        assert found["depth_m"].shape == (96, 64)
+        np.testing.assert_allclose(found["depth_m"][:40], depth_near(120), rtol=1e-3)
+        np.testing.assert_allclose(found["depth_m"][56:], depth_near(30), rtol=1e-3)
+        np.testing.assert_array_equal(found["K"], [[300, 0, 33], [0, 300, 40], [0, 0, 1]])
+
+
+def test_a_resized_frame_rescales_the_camera_and_warns(bench: TestClient) -> None:
+    response = ask(bench, png(grey(60, 32, 48)), format="npy")
+    np.testing.assert_allclose(npy(response), depth_near(60, 3.0, 0.25), rtol=1e-3)
+    warning = response.headers["Camind-Warnings"]
+    assert "48x32" in warning
+    assert "96x64" in warning
+
+
+def test_another_frame_is_refused_with_both_sizes(bench: TestClient) -> None:
+    refused(ask(bench, png(grey(60, 64, 64))), 422, "64x64", "96x64", "image-size-mismatch")
+
+
+def test_another_focus_distance_moves_k_cam_and_warns_without_a_focal_length(bench: TestClient) -> None:
+    response = ask(bench, format="npy", focus_distance_m=1.0)
+    np.testing.assert_allclose(npy(response), depth_near(LEVEL, 12.0, 0.5, 1.0), rtol=1e-3)
+    assert "focal length" in response.headers["Camind-Warnings"]
+
+
+def test_a_lens_moves_focus_exactly_but_not_nearer_than_its_focal_length(
+    client: TestClient, d200: dict[str, Any]
+) -> None:
+    client.post("/cameras", json=d200)
+    picture = png(grey(60, 432, 645))
+    assert ask(client, picture, camera="d200", focus_distance_m=1.5).headers["Camind-Warnings"] == ""
+    with np.load(io.BytesIO(ask(client, picture, camera="d200", format="npz").content)) as stored:
+        assert stored["K"][0, 0] == pytest.approx(35e3 / 6.05 * 645 / 3872)
+    problem = refused(ask(client, picture, camera="d200", focus_distance_m=0.03), 422, "focal length")
+    assert problem["errors"][0]["pointer"] == "focus_distance_m"
+
+
+@pytest.mark.parametrize(
+    ("query", "word"),
+    [
+        ({"camera": None}, "camera"),
+        ({"side": "left"}, "side"),
+        ({"format": "gif"}, "npy"),
+        ({"format": ""}, "format"),
+        ({"focus_distance_m": 0}, "focus_distance_m"),
+        ({"focus_distance_m": -1}, "focus_distance_m"),
+        ({"focus_distance_m": "nan"}, "focus_distance_m"),
+        ({"focus_distance_m": "inf"}, "focus_distance_m"),
+        ({"at": "12"}, "u,v"),
+        ({"at": "a,b"}, "u,v"),
+        ({"at": "nan,1"}, "u,v"),
+        ({"at": "96,3", "format": "json"}, "96x64"),
+        ({"at": "3,-1", "format": "json"}, "96x64"),
+        ({"colour": "red"}, "colour"),
+    ],
+)
+def test_a_wrong_parameter_is_422_and_named(bench: TestClient, query: dict[str, Any], word: str) -> None:
+    refused(ask(bench, **query), 422, word)
+
+
+def test_an_unknown_camera_is_404(bench: TestClient) -> None:
+    refused(ask(bench, camera="nobody"), 404, "nobody")
+
+
+@pytest.mark.parametrize(
+    ("body", "kind", "status", "word"),
+    [
+        (b"", "image/jpeg", 422, "empty"),
+        (jpeg(corners())[:-100], "image/jpeg", 422, "cut off"),
+        (png(corners())[:-20], "image/png", 422, "cut off"),
+        (b"this is a letter, not a picture", "image/jpeg", 415, "JPEG"),
+        (png(corners()), "text/plain", 415, "text/plain"),
+        (png(corners()), "application/json", 415, "application/json"),
+        (b"GIF89a" + bytes(60), "image/gif", 415, "image/gif"),
+        (bytes(2_000_001), "image/png", 413, "2000000"),
+    ],
+)
+def test_bytes_that_are_no_photograph_are_refused(
+    bench: TestClient, body: bytes, kind: str, status: int, word: str
+) -> None:
+    refused(ask(bench, body, {"Content-Type": kind}), status, word)
+
+
+def test_a_huge_picture_in_a_small_file_is_413(bench: TestClient) -> None:
+    started = time.perf_counter()
+    refused(ask(bench, hostile_png()), 413, "20000x20000")
+    assert time.perf_counter() - started < 5
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        {"files": {"picture": ("a.png", b"x", "image/png")}},
+        {"files": [("image", ("a.png", b"x")), ("image", ("b.png", b"x"))]},
+        {"files": {"image": ("a.png", b"x")}, "data": {"camera": "bench"}},
+        {"content": b"--x\r\n", "headers": {"Content-Type": "multipart/form-data; boundary=x"}},
+        {"content": b"what", "headers": {"Content-Type": "multipart/form-data"}},
+    ],
+)
+def test_a_form_without_exactly_the_field_is_422(bench: TestClient, form: dict[str, Any]) -> None:
+    refused(bench.post("/depth?camera=bench", **form), 422, "image")
+
+
+def test_a_form_of_the_wrong_kind_or_without_bytes_is_refused(bench: TestClient) -> None:
+    refused(bench.post("/depth?camera=bench", files={"image": ("a.txt", b"x", "text/plain")}), 415)
+    refused(bench.post("/depth?camera=bench", files={"image": ("a.png", b"", "image/png")}), 422, "empty")
+
+
+def test_no_room_is_503_with_retry_after(settings: Settings, app: FastAPI) -> None:
+    with TestClient(app) as client:
+        client.post("/cameras", json=CAMERA)
+        app.state.worker.close()
+        app.state.worker = Worker(slots=1, queue_size=0, deadline_s=1e-6)
+        response = ask(client)
+        refused(response, 503, "No answer within")
+        assert int(response.headers["retry-after"]) >= 1
+    assert settings.queue_size > 0
+
+
+def test_a_client_that_goes_away_gives_up_its_place(app: FastAPI) -> None:
+    release = threading.Event()
+    received: list[MutableMapping[str, Any]] = [
+        {"type": "http.request", "body": png(grey())},
+        {"type": "http.disconnect"},
+    ]
+    sent: list[MutableMapping[str, Any]] = []
+
+    def hold(_: Cancellation) -> None:
+        release.wait(10)
+
+    async def receive() -> MutableMapping[str, Any]:
+        return received.pop(0)
+
+    async def send(message: MutableMapping[str, Any]) -> None:
+        sent.append(message)
+
+    async def scenario(worker: Worker) -> None:
+        holding = asyncio.create_task(worker.run(hold))
+        await asyncio.sleep(0.02)
+        scope: dict[str, Any] = {"type": "http", "method": "POST", "path": "/depth", "headers": []}
+        scope |= {"raw_path": b"/depth", "root_path": "", "query_string": b"camera=bench"}
+        scope |= {"http_version": "1.1", "scheme": "http"}
+        await asyncio.wait_for(app(scope, receive, send), timeout=5)
+        assert worker.in_flight == 1
+        release.set()
+        await holding
+
+    with TestClient(app) as client:
+        client.post("/cameras", json=CAMERA)
+        asyncio.run(scenario(app.state.worker))
+    assert sent[0]["status"] == 499
+
+
+def test_ten_requests_leave_no_memory_behind(client: TestClient) -> None:
+    client.post("/cameras", json=CAMERA | {"image_width_px": 640, "image_height_px": 480})
+    body = jpeg(np.random.default_rng(0).integers(0, 200, (480, 640, 3), np.uint8))
+
+    def resident_mb() -> float:
+        with open("/proc/self/statm", encoding="ascii") as stream:  # noqa: PTH123
+            return int(stream.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+    ask(client, body, {"Content-Type": "image/jpeg"})
+    before_mb = resident_mb()
+    for _ in range(10):
+        assert ask(client, body, {"Content-Type": "image/jpeg"}).status_code == 200
+    assert resident_mb() - before_mb < 60
+
+
+def test_the_document_lists_every_form_and_every_kind(client: TestClient) -> None:
+    operation = client.get("/openapi.json").json()["paths"]["/depth"]["post"]
+    assert set(operation["responses"]["200"]["content"]) == {*MEDIA_TYPES.values(), "application/json"}
+    assert {"image/jpeg", "image/png", "multipart/form-data"} <= set(operation["requestBody"]["content"])
+    assert {"404", "406", "413", "415", "422", "503"} <= set(operation["responses"])
+    assert {parameter["name"] for parameter in operation["parameters"]} == {
+        *("camera", "side", "format", "at", "focus_distance_m")
+    }

@@ -1,0 +1,108 @@
+"""Photographs as bytes, made by the codecs themselves or, where no codec writes them, by hand."""
+
+import struct
+import zlib
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.opencv import cv2
+
+Pixels = NDArray[Any]
+Order = Literal["<", ">"]
+
+
+def corners(height: int = 48, width: int = 64) -> NDArray[np.uint8]:
+    """Red top left, green top right, blue bottom left, white bottom right: no two turns look alike."""
+    rgb = np.empty((height, width, 3), np.uint8)
+    top, left = height // 2, width // 2
+    rgb[:top, :left], rgb[:top, left:] = (255, 0, 0), (0, 255, 0)
+    rgb[top:, :left], rgb[top:, left:] = (0, 0, 255), (255, 255, 255)
+    return rgb
+
+
+def encoded(kind: str, rgb: Pixels, *options: int) -> bytes:
+    """RGB, RGBA or grey pixels in the file format of an extension (``.png``)."""
+    bgr = rgb
+    if rgb.ndim == 3:
+        bgr = rgb[..., [2, 1, 0, 3]] if rgb.shape[2] == 4 else rgb[..., ::-1]
+    is_written, body = cv2.imencode(kind, np.ascontiguousarray(bgr), options)
+    assert is_written
+    return body.tobytes()
+
+
+def exif_block(orientation: int, order: Order = "<") -> bytes:
+    """A TIFF structure whose only entry is the orientation."""
+    mark = b"II*\x00" if order == "<" else b"MM\x00*"
+    entry = struct.pack(order + "HHIHH", 274, 3, 1, orientation, 0)
+    return mark + struct.pack(order + "IH", 8, 1) + entry + struct.pack(order + "I", 0)
+
+
+def jpeg(rgb: Pixels, orientation: int | None = None, order: Order = "<", quality: int = 98) -> bytes:
+    """A JPEG, with an EXIF orientation if one is given."""
+    data = encoded(".jpg", rgb, cv2.IMWRITE_JPEG_QUALITY, quality)
+    if orientation is None:
+        return data
+    payload = b"Exif\x00\x00" + exif_block(orientation, order)
+    return data[:2] + b"\xff\xe1" + struct.pack(">H", len(payload) + 2) + payload + data[2:]
+
+
+def png_chunk(name: bytes, payload: bytes) -> bytes:
+    return struct.pack(">I", len(payload)) + name + payload + struct.pack(">I", zlib.crc32(name + payload))
+
+
+def png(rgb: Pixels, orientation: int | None = None) -> bytes:
+    """A PNG, with an EXIF orientation if one is given."""
+    data = encoded(".png", rgb)
+    if orientation is None:
+        return data
+    return data[:33] + png_chunk(b"eXIf", exif_block(orientation)) + data[33:]
+
+
+def webp(rgb: Pixels, orientation: int | None = None) -> bytes:
+    """A lossless WebP, with an EXIF orientation if one is given."""
+    data = encoded(".webp", rgb, cv2.IMWRITE_WEBP_QUALITY, 101)
+    if orientation is None:
+        return data
+    start = data.index(b"VP8L")
+    exif = exif_block(orientation)
+    size: bytes = (rgb.shape[1] - 1).to_bytes(3, "little") + (rgb.shape[0] - 1).to_bytes(3, "little")
+    extended = b"VP8X" + struct.pack("<I", 10) + b"\x08\x00\x00\x00" + size
+    chunks = extended + data[start:] + b"EXIF" + struct.pack("<I", len(exif)) + exif
+    return b"RIFF" + struct.pack("<I", len(chunks) + 4) + b"WEBP" + chunks
+
+
+def tiff(rgb: NDArray[np.uint8] | NDArray[np.uint16], orientation: int = 1, order: Order = "<") -> bytes:
+    """An uncompressed RGB TIFF of one strip."""
+    height, width, _ = rgb.shape
+    stored = rgb.astype(rgb.dtype.newbyteorder(order)).tobytes()
+    bits = rgb.dtype.itemsize * 8
+    mark = b"II*\x00" if order == "<" else b"MM\x00*"
+    tags = [
+        (256, 3, 1, width),
+        (257, 3, 1, height),
+        (258, 3, 3, 8),
+        (259, 3, 1, 1),
+        (262, 3, 1, 2),
+        (273, 4, 1, 14),
+        (274, 3, 1, orientation),
+        (277, 3, 1, 3),
+        (278, 3, 1, height),
+        (279, 4, 1, len(stored)),
+    ]
+    head = mark + struct.pack(order + "I", 14 + len(stored)) + struct.pack(order + "HHH", bits, bits, bits)
+    directory = struct.pack(order + "H", len(tags))
+    for tag, kind, count, value in tags:
+        is_short = kind == 3 and count == 1
+        directory += struct.pack(order + "HHI", tag, kind, count)
+        directory += struct.pack(order + "HH", value, 0) if is_short else struct.pack(order + "I", value)
+    return head + stored + directory + struct.pack(order + "I", 0)
+
+
+def hostile_png(side: int = 20_000) -> bytes:
+    """A valid PNG of side x side black pixels, one bit each, in some ten kB: decoded, it takes gigabytes."""
+    rows = b"\x00" * (side * (1 + -(-side // 8)))
+    header = struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)
+    chunks = png_chunk(b"IHDR", header) + png_chunk(b"IDAT", zlib.compress(rows)) + png_chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + chunks

@@ -1,0 +1,154 @@
+"""Every form of the answer is read back to the numbers it was made of."""
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+
+from service.errors import BadRequest
+from service.inference.depth_map import DepthMap
+from service.inference.encode import (
+    ENCODERS,
+    MEDIA_TYPES,
+    encode_npy,
+    encode_npz,
+    encode_ply,
+    encode_png,
+    encode_preview,
+    encode_tiff,
+    read_point,
+    spread_of,
+)
+from service.opencv import cv2
+from service.optics.camera import Camera, Intrinsics
+
+CAMERA = Camera(40, 30, 2.0, 6.0, intrinsics=Intrinsics(50.0, 52.0, 19.5, 14.5))
+RGB = np.random.default_rng(1).integers(0, 255, (30, 40, 3), np.uint8)
+
+
+@pytest.fixture
+def answer() -> DepthMap:
+    depth_m = np.linspace(0.5, 4.0, 1200, dtype=np.float32).reshape(30, 40)
+    depth_m[0, 0] = np.nan
+    alt_m = np.where(depth_m > 3, np.nan, depth_m * 2).astype(np.float32)
+    ones = np.ones_like(depth_m)
+    return DepthMap(
+        depth_m=depth_m,
+        depth_alt_m=alt_m,
+        p_near=ones * np.float32(0.75),
+        sigma_m=depth_m * np.float32(0.1),
+        blur_px=ones,
+        valid=np.isfinite(depth_m),
+        camera=CAMERA,
+        scales=(1.0,),
+        warnings=(),
+        timings_ms={},
+    )
+
+
+def read_png(body: bytes) -> NDArray[np.uint16]:
+    pixels = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert pixels is not None
+    assert pixels.dtype == np.uint16
+    return np.asarray(pixels, np.uint16)
+
+
+def test_png_holds_millimetres_and_zero_for_no_answer(answer: DepthMap) -> None:
+    encoded = encode_png(answer, RGB)
+    pixels = read_png(encoded.body)
+    assert encoded.depth_scale_m == 0.001
+    assert pixels[0, 0] == 0
+    np.testing.assert_allclose(pixels[answer.valid] * 0.001, answer.depth_m[answer.valid], atol=0.00051)
+
+
+def test_png_has_no_answer_beyond_what_it_can_hold_and_says_so(answer: DepthMap) -> None:
+    answer.depth_m[5, 5] = 65.535
+    answer.depth_m[5, 6] = 70.0
+    answer.depth_m[5, 7] = np.inf
+    encoded = encode_png(answer, RGB)
+    np.testing.assert_array_equal(read_png(encoded.body)[5, 5:8], (65535, 0, 0))
+    assert "65.535 m" in encoded.warnings[0]
+
+
+def test_npy_and_tiff_hold_the_very_floats(answer: DepthMap) -> None:
+    for pixels in (
+        np.load(io.BytesIO(encode_npy(answer, RGB).body), allow_pickle=False),
+        tifffile.imread(io.BytesIO(encode_tiff(answer, RGB).body)),
+    ):
+        assert pixels.dtype == np.float32
+        np.testing.assert_array_equal(pixels, answer.depth_m)
+
+
+def test_npz_holds_all_maps_and_the_camera_matrix(answer: DepthMap) -> None:
+    with np.load(io.BytesIO(encode_npz(answer, RGB).body), allow_pickle=False) as stored:
+        assert set(stored) == {"depth_m", "depth_alt_m", "p_near", "sigma_m", "blur_px", "valid", "K"}
+        np.testing.assert_array_equal(stored["depth_alt_m"], answer.depth_alt_m)
+        np.testing.assert_array_equal(stored["valid"], answer.valid)
+        np.testing.assert_array_equal(stored["K"], [[50, 0, 19.5], [0, 52, 14.5], [0, 0, 1]])
+
+
+def test_unknown_intrinsics_are_nan_in_npz_and_no_point_cloud(answer: DepthMap) -> None:
+    blind = replace(answer, camera=replace(CAMERA, intrinsics=None))
+    with np.load(io.BytesIO(encode_npz(blind, RGB).body)) as stored:
+        assert np.isnan(stored["K"]).sum() == 4
+    with pytest.raises(BadRequest, match="focal length"):
+        encode_ply(blind, RGB)
+
+
+def test_ply_points_project_back_to_their_pixels(answer: DepthMap) -> None:
+    head, _, body = encode_ply(answer, RGB).body.partition(b"end_header\n")
+    assert b"element vertex 1199\n" in head
+    kinds = [(axis, "<f4") for axis in "xyz"] + [(colour, "u1") for colour in "rgb"]
+    points = np.frombuffer(body, np.dtype(kinds))
+    v, u = np.nonzero(answer.valid)
+    np.testing.assert_allclose(points["x"] / points["z"] * 50 + 19.5, u, atol=1e-3)
+    np.testing.assert_allclose(points["y"] / points["z"] * 52 + 14.5, v, atol=1e-3)
+    np.testing.assert_array_equal(np.stack([points[c] for c in "rgb"], 1), RGB[v, u])
+
+
+def test_preview_is_near_red_far_blue_and_grey_without_an_answer(answer: DepthMap) -> None:
+    answer.depth_m[:8, :8] = np.nan
+    pixels = cv2.imdecode(np.frombuffer(encode_preview(answer, RGB).body, np.uint8), cv2.IMREAD_COLOR_RGB)
+    assert pixels is not None
+    assert pixels.shape == (30, 40, 3)
+    nothing, near, far = (pixels[v, u].astype(int) for v, u in ((3, 3), (3, 30), (27, 20)))
+    assert np.ptp(nothing) < 16
+    assert near[0] > near[2]
+    assert far[2] > far[0]
+
+
+@pytest.mark.parametrize("level", [np.nan, 1.5])
+def test_preview_of_nothing_or_of_one_depth_is_a_picture_too(answer: DepthMap, level: float) -> None:
+    flat = replace(answer, depth_m=np.full((200, 220), level, np.float32))
+    assert encode_preview(flat, RGB).body.startswith(b"\xff\xd8\xff")
+
+
+def test_every_format_states_its_media_type(answer: DepthMap) -> None:
+    assert {name: encode(answer, RGB).media_type for name, encode in ENCODERS.items()} == MEDIA_TYPES
+
+
+def test_spread_is_that_of_the_pixels_with_an_answer(answer: DepthMap) -> None:
+    spread = spread_of(answer)
+    known = answer.depth_m[answer.valid]
+    assert spread.min == pytest.approx(known.min())
+    assert spread.median == pytest.approx(np.median(known))
+    assert spread.max == pytest.approx(4.0)
+    nothing = spread_of(replace(answer, valid=np.zeros((30, 40), np.bool_)))
+    assert (nothing.min, nothing.p5, nothing.median, nothing.p95, nothing.max) == (None,) * 5
+
+
+def test_a_point_is_read_at_the_pixel_whose_area_holds_it(answer: DepthMap) -> None:
+    for u, v in ((12, 7), (11.5, 6.5), (12.49, 7.49)):
+        assert read_point(answer, u, v).depth_m == pytest.approx(float(answer.depth_m[7, 12]))
+    assert read_point(answer, 12, 7).sigma_m == pytest.approx(float(answer.sigma_m[7, 12]))
+    assert read_point(answer, 0, 0).depth_m is None
+    assert read_point(answer, 39, 29).depth_alt_m is None
+
+
+@pytest.mark.parametrize(("u", "v"), [(40, 0), (0, 30), (-1, 0), (39.5, 0), (-0.51, 0)])
+def test_a_point_outside_is_refused(answer: DepthMap, u: float, v: float) -> None:
+    with pytest.raises(BadRequest, match="40x30"):
+        read_point(answer, u, v)

@@ -1,0 +1,74 @@
+"""The camera follows its photograph: turned, resized, or refused."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from service.errors import ImageSizeMismatch
+from service.inference.frame import camera_of
+from service.inference.images import TURNS, Photograph, turned
+from service.opencv import cv2
+from service.optics.camera import Camera, Intrinsics
+
+DISTORTION = (-0.1, 0.02, 0.003, -0.005, 0.001, 0.01, 0.002, 0.001, 0.004, -0.003, 0.002, 0.005)
+INTRINSICS = Intrinsics(500.0, 520.0, 300.0, 210.0, DISTORTION)
+CAMERA = Camera(640, 480, 2.0, 6.0, 0.5, intrinsics=INTRINSICS)
+
+
+def photograph(width: int, height: int, orientation: int = 1) -> Photograph:
+    """Stored width x height, turned upright."""
+    rgb = np.zeros((height, width, 3), np.uint8)
+    return Photograph(turned(rgb, orientation), "jpeg", orientation, width, height)
+
+
+def projected(intrinsics: Intrinsics, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    matrix = np.array([[intrinsics.fx_px, 0, intrinsics.cx_px], [0, intrinsics.fy_px, intrinsics.cy_px], [0, 0, 1]])
+    still = np.zeros(3)
+    pixels, _ = cv2.projectPoints(points, still, still, matrix, np.array(intrinsics.distortion))
+    return np.asarray(pixels, np.float64)[:, 0]
+
+
+@pytest.mark.parametrize("orientation", TURNS)
+def test_turned_intrinsics_project_the_turned_world_to_the_turned_picture(orientation: int) -> None:
+    transposed, flip_u, flip_v = TURNS[orientation]
+    points = np.random.default_rng(0).uniform(-1, 1, (40, 3)) + np.array([0, 0, 3])
+    pixels = projected(INTRINSICS, points)
+    camera, warnings = camera_of(photograph(640, 480, orientation), CAMERA)
+    assert warnings == ()
+    assert camera.k_cam_px == CAMERA.k_cam_px
+    assert camera.intrinsics is not None
+    if transposed:
+        pixels, points = pixels[:, ::-1].copy(), points[:, [1, 0, 2]]
+    if flip_u:
+        pixels[:, 0] = camera.image_width_px - 1 - pixels[:, 0]
+        points = points * (-1, 1, 1)
+    if flip_v:
+        pixels[:, 1] = camera.image_height_px - 1 - pixels[:, 1]
+        points = points * (1, -1, 1)
+    np.testing.assert_allclose(projected(camera.intrinsics, points), pixels, atol=1e-9)
+
+
+def test_a_landscape_camera_takes_a_phone_held_upright() -> None:
+    camera, warnings = camera_of(photograph(4080, 3072, 6), Camera(4080, 3072, 2.0, 1.31, 0.6))
+    assert (camera.image_width_px, camera.image_height_px) == (3072, 4080)
+    assert camera.k_cam_px == 1.31
+    assert warnings == ()
+
+
+def test_a_camera_registered_by_its_upright_size_takes_it_too() -> None:
+    camera, _ = camera_of(photograph(4080, 3072, 6), Camera(3072, 4080, 2.0, 1.31, 0.6))
+    assert (camera.image_width_px, camera.image_height_px) == (3072, 4080)
+
+
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_a_resized_frame_scales_the_blur_constants_and_says_so(orientation: int) -> None:
+    camera, warnings = camera_of(photograph(320, 240, orientation), CAMERA)
+    assert camera.k_cam_px == pytest.approx(3.0)
+    assert camera.gamma_px == pytest.approx(0.25)
+    assert "k_cam_px 3" in warnings[0]
+
+
+@pytest.mark.parametrize(("width", "height"), [(640, 400), (480, 640), (641, 300)])
+def test_another_frame_is_refused_with_both_sizes(width: int, height: int) -> None:
+    with pytest.raises(ImageSizeMismatch, match=rf"{width}x{height}.*640x480"):
+        camera_of(photograph(width, height), CAMERA)

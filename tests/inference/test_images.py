@@ -1,0 +1,162 @@
+"""The door for photographs: what is let in comes out upright and whole, what is not is refused early."""
+
+import importlib.util
+import resource
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from service.errors import InvalidImage, TooLarge, UnsupportedKind
+from service.inference.headers import read_header
+from service.inference.images import TURNS, ImageLimits, read_photograph
+from tests.inference.photographs import Order, corners, encoded, hostile_png, jpeg, png, tiff, webp
+
+MAKERS: dict[str, Callable[..., bytes]] = {"jpeg": jpeg, "png": png, "tiff": tiff, "webp": webp}
+# corners as they must appear upright: top left, top right, bottom left, bottom right
+UPRIGHT = {1: "rgbw", 2: "grwb", 3: "wbgr", 4: "bwrg", 5: "rbgw", 6: "brwg", 7: "wgbr", 8: "gwrb"}
+COLOURS = {"r": (255, 0, 0), "g": (0, 255, 0), "b": (0, 0, 255), "w": (255, 255, 255)}
+
+
+@pytest.mark.parametrize("orientation", TURNS)
+@pytest.mark.parametrize("kind", MAKERS)
+def test_orientation_is_applied_exactly_once(kind: str, orientation: int) -> None:
+    photograph = read_photograph(MAKERS[kind](corners(), orientation))
+    turned = orientation >= 5
+    assert photograph.rgb.shape == ((64, 48, 3) if turned else (48, 64, 3))
+    assert (photograph.stored_width_px, photograph.stored_height_px) == (64, 48)
+    assert (photograph.kind, photograph.orientation) == (kind, orientation)
+    rgb = photograph.rgb.astype(int)
+    found = (rgb[4, 4], rgb[4, -5], rgb[-5, 4], rgb[-5, -5])
+    for pixel, letter in zip(found, UPRIGHT[orientation], strict=True):
+        assert np.abs(pixel - COLOURS[letter]).max() <= 6
+
+
+@pytest.mark.parametrize("orientation", [0, 9, 65535])
+def test_an_orientation_that_exif_does_not_know_is_none(orientation: int) -> None:
+    assert read_photograph(jpeg(corners(), orientation)).orientation == 1
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_both_byte_orders_are_read(order: Order) -> None:
+    assert read_header(jpeg(corners(), 6, order)).orientation == 6
+    photograph = read_photograph(tiff(corners(), 6, order))
+    assert photograph.rgb.shape == (64, 48, 3)
+    np.testing.assert_array_equal(photograph.rgb[0, 0], (0, 0, 255))
+
+
+@pytest.mark.parametrize("kind", MAKERS)
+def test_the_header_states_the_decoded_size(kind: str) -> None:
+    data = MAKERS[kind](corners(33, 71))
+    header = read_header(data)
+    assert (header.width_px, header.height_px) == (71, 33)
+    assert read_photograph(data).rgb.shape == (33, 71, 3)
+
+
+def test_lossy_webp_is_read() -> None:
+    assert read_photograph(encoded(".webp", corners(), 64, 80)).rgb.shape == (48, 64, 3)
+
+
+@pytest.mark.parametrize("kind", [".png", ".tiff"])
+def test_sixteen_bits_are_scaled_and_not_cut(kind: str) -> None:
+    deep = np.random.default_rng(0).integers(0, 65535, (50, 60, 3), np.uint16, endpoint=True)
+    deep[0, 0] = (65535, 32896, 0)
+    rgb = read_photograph(encoded(kind, deep)).rgb
+    np.testing.assert_array_equal(rgb[0, 0], (255, 128, 0))
+    assert np.abs(rgb - deep / 257).max() <= 0.5
+
+
+def test_grey_becomes_rgb_and_alpha_is_dropped() -> None:
+    grey = np.full((10, 12), 77, np.uint8)
+    np.testing.assert_array_equal(read_photograph(encoded(".png", grey)).rgb[3, 3], (77, 77, 77))
+    clear = np.dstack([corners(), np.zeros((48, 64), np.uint8)])
+    np.testing.assert_array_equal(read_photograph(encoded(".png", clear)).rgb, corners())
+
+
+@pytest.mark.parametrize("kept", [0.05, 0.5, 0.9, 0.99])
+@pytest.mark.parametrize("kind", MAKERS)
+def test_a_file_that_is_cut_off_is_refused(kind: str, kept: float) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)
+    data = MAKERS[kind](noise)
+    with pytest.raises(InvalidImage, match=kind):
+        read_photograph(data[: int(len(data) * kept)])
+
+
+@pytest.mark.parametrize("kind", MAKERS)
+def test_no_prefix_of_a_file_gets_past_the_door(kind: str) -> None:
+    data = MAKERS[kind](corners(16, 16), 6)
+    for length in range(4, len(data) - 5):
+        with pytest.raises((InvalidImage, UnsupportedKind)):
+            read_photograph(data[:length])
+
+
+def test_a_file_that_ends_in_zeros_is_refused() -> None:
+    data = jpeg(corners())
+    with pytest.raises(InvalidImage):
+        read_photograph(data[: len(data) // 2] + bytes(len(data) // 2))
+
+
+def test_a_damaged_png_is_refused() -> None:
+    data = bytearray(png(corners()))
+    data[60] ^= 1
+    with pytest.raises(InvalidImage, match="checksum"):
+        read_photograph(bytes(data))
+
+
+def test_what_stands_behind_the_end_of_a_jpeg_does_no_harm() -> None:
+    assert read_photograph(jpeg(corners()) + b"a maker's trailer").rgb.shape == (48, 64, 3)
+
+
+@pytest.mark.parametrize("data", [b"hello, world", b"%PDF-1.7", b"GIF89a" + bytes(50), b"\x00" * 100, b"RIFF"])
+def test_bytes_that_are_no_listed_kind_are_refused(data: bytes) -> None:
+    with pytest.raises(UnsupportedKind):
+        read_photograph(data, "image/jpeg")
+
+
+def test_an_empty_body_is_refused() -> None:
+    with pytest.raises(InvalidImage, match="empty"):
+        read_photograph(b"", "image/jpeg")
+
+
+@pytest.mark.parametrize("declared", ["text/plain", "application/json", "image/gif", "image/svg+xml"])
+def test_a_declared_type_that_is_not_listed_is_refused(declared: str) -> None:
+    with pytest.raises(UnsupportedKind, match="image/jpeg"):
+        read_photograph(jpeg(corners()), declared)
+
+
+def test_the_bytes_decide_and_a_wrong_declaration_is_told() -> None:
+    photograph = read_photograph(png(corners()), "image/jpeg; charset=binary")
+    assert photograph.kind == "png"
+    assert len(photograph.warnings) == 1
+    for declared in (None, "image/png", "application/octet-stream", "IMAGE/PNG"):
+        assert read_photograph(png(corners()), declared).warnings == ()
+
+
+def test_a_tiff_of_floating_point_numbers_is_refused() -> None:
+    with pytest.raises(UnsupportedKind, match="floating"):
+        read_photograph(encoded(".tiff", np.ones((8, 8, 3), np.float32)))
+
+
+def test_bytes_and_pixels_are_limited_before_decoding() -> None:
+    with pytest.raises(TooLarge, match="bytes"):
+        read_photograph(png(corners()), limits=ImageLimits(max_bytes=50))
+    with pytest.raises(TooLarge, match="64x48"):
+        read_photograph(png(corners()), limits=ImageLimits(max_pixels=64 * 48 - 1))
+    assert read_photograph(png(corners()), limits=ImageLimits(max_pixels=64 * 48)).width_px == 64
+
+
+def test_a_small_file_of_a_huge_picture_costs_no_memory() -> None:
+    data = hostile_png()
+    assert len(data) < 300_000
+    before_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(TooLarge, match="20000x20000"):
+        read_photograph(data, "image/png")
+    grown_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kb
+    assert grown_kb < 20_000
+
+
+def test_heic_without_its_decoder_is_an_unsupported_kind() -> None:
+    if importlib.util.find_spec("pi_heif"):
+        pytest.skip("the decoder is installed")
+    with pytest.raises(UnsupportedKind, match="heic"):
+        read_photograph(b"\x00\x00\x00\x18ftypheic" + bytes(40))

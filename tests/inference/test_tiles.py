@@ -1,0 +1,87 @@
+"""Tiles cover the photograph, fade into each other, and change nothing but the memory."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from service.inference.artifact import load_model_folder
+from service.inference.estimator import Estimator
+from service.inference.pair import GraphPair
+from service.inference.tiles import OVERLAP_PX, fades, read_in_tiles, spans
+from service.opencv import cv2
+from service.optics.camera import Camera
+from tests.inference.oracle_pair import build_oracle_pair
+
+
+@given(size=st.integers(300, 9000), side=st.integers(18, 80).map(lambda n: n * 16))
+def test_spans_cover_everything_and_overlap_enough(size: int, side: int) -> None:
+    found = spans(size, max(side, 2 * OVERLAP_PX + 16), 16)
+    assert found[0].start == 0
+    assert found[-1].stop == size
+    for one, following in pairwise(found):
+        assert following.start % 16 == 0
+        assert one.stop - following.start >= OVERLAP_PX
+    assert max(span.stop - span.start for span in found) <= max(side, 2 * OVERLAP_PX + 16) + 16
+
+
+@given(size=st.integers(300, 5000), stride=st.sampled_from([1, 2, 4]))
+def test_weights_sum_to_one_at_every_pixel(size: int, stride: int) -> None:
+    found = spans(size, 512, 16)
+    total = np.zeros(-(-size // stride))
+    for span, weight in zip(found, fades(found, stride), strict=True):
+        assert (weight >= 0).all()
+        total[span.start // stride : span.start // stride + len(weight)] += weight
+    np.testing.assert_allclose(total, 1, atol=1e-5)
+
+
+def test_a_reader_that_disagrees_with_itself_leaves_no_seam() -> None:
+    answers = iter(range(100))
+
+    def read(tile: NDArray[np.uint8]) -> dict[str, NDArray[np.float32]]:
+        return {"level": np.full(tile.shape[:2], next(answers), np.float32)}
+
+    rgb = np.zeros((900, 1100, 3), np.uint8)
+    level = read_in_tiles(rgb, read, multiple=16, stride=1, pixel_budget=300_000)["level"]
+    assert level.max() > 2
+    steps = max(np.abs(np.diff(level, axis=0)).max(), np.abs(np.diff(level, axis=1)).max())
+    assert steps < 0.06
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> GraphPair:
+    return GraphPair(load_model_folder(build_oracle_pair(tmp_path_factory.mktemp("model"))), 1)
+
+
+@pytest.mark.parametrize(("height", "width"), [(701, 1003), (400, 1600)])
+def test_tiled_equals_untiled(pair: GraphPair, height: int, width: int) -> None:
+    rgb = np.random.default_rng(0).integers(30, 130, (height // 20, width // 20, 3), np.uint8)
+    rgb = np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_CUBIC), np.uint8)
+    camera = Camera(width, height, 2.0, 6.0, 0.5)
+    whole = Estimator(pair, pixel_budget=10**9).estimate(rgb, camera)
+    tiled = Estimator(pair, pixel_budget=200_000).estimate(rgb, camera)
+    for name in ("depth_m", "depth_alt_m", "p_near", "sigma_m", "blur_px"):
+        np.testing.assert_allclose(getattr(tiled, name), getattr(whole, name), rtol=1e-4, atol=1e-5)
+
+
+def test_a_tile_is_never_much_larger_than_the_budget() -> None:
+    sizes: list[int] = []
+
+    def read(tile: NDArray[np.uint8]) -> dict[str, NDArray[np.float32]]:
+        sizes.append(tile.shape[0] * tile.shape[1])
+        return {"level": np.zeros((-(-tile.shape[0] // 2), -(-tile.shape[1] // 2)), np.float32)}
+
+    rgb: NDArray[np.uint8] = np.broadcast_to(np.zeros(3, np.uint8), (3072, 4080, 3))
+    merged = read_in_tiles(rgb, read, multiple=16, stride=2)
+    assert merged["level"].shape == (1536, 2040)
+    assert max(sizes) <= 1_600_000
+
+
+def test_a_model_folder_path_with_a_stride_of_one_is_read_alike(tmp_path: Path) -> None:
+    estimator = Estimator.from_folder(load_model_folder(build_oracle_pair(tmp_path / "m", stride=1)))
+    answer = estimator.estimate(np.full((33, 47, 3), 90, np.uint8), Camera(47, 33, 2.0, 6.0), "near")
+    np.testing.assert_allclose(answer.depth_m, answer.depth_m[0, 0], rtol=1e-5)
