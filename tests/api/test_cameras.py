@@ -1,0 +1,316 @@
+"""Cameras over HTTP: registered, read, replaced, deleted, listed, and refused where they make no sense."""
+
+import json
+import math
+from datetime import datetime
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from service.optics import thin_lens
+
+PROBLEM = "application/problem+json"
+
+
+def test_lens_specs_become_a_camera(client: TestClient, d200: dict[str, Any]) -> None:
+    answer = client.post("/cameras", json=d200)
+    assert answer.status_code == 201
+    assert answer.headers["location"] == "/cameras/d200"
+    assert answer.headers["etag"] == '"1"'
+    camera = answer.json()
+    expected = thin_lens.k_cam(35e-3, 2.8, 2.0, 6.05e-6, 645 / 3872, 4.0)
+    assert camera["k_cam_px"] == pytest.approx(expected, rel=1e-12)
+    assert camera["source"] == "lens"
+    assert camera["k_r"] == 4.0
+    assert camera["fx_px"] == pytest.approx(35e3 / 6.05 * 645 / 3872)
+    assert camera["lens"] == {**d200["lens"], "k_r": 4.0}
+    assert camera["revision"] == 1
+    far = 0.1 * 2.0 * expected / 0.25
+    assert camera["range_m"] == {"near": pytest.approx(0.035), "far": pytest.approx(far)}
+    assert datetime.fromisoformat(camera["created_at"]).utcoffset() is not None
+    assert client.get(answer.headers["location"]).json() == camera
+
+
+def test_a_given_k_cam_is_kept(client: TestClient, phone: dict[str, Any]) -> None:
+    camera = client.post("/cameras", json=phone).json()
+    assert (camera["k_cam_px"], camera["gamma_px"], camera["source"]) == (1.31, 0.6, "given")
+    assert (camera["fx_px"], camera["lens"], camera["intrinsics"]) == (None, None, None)
+
+
+def test_gamma_and_k_r_have_defaults(client: TestClient, d200: dict[str, Any]) -> None:
+    del d200["gamma_px"]
+    camera = client.post("/cameras", json=d200).json()
+    assert (camera["gamma_px"], camera["k_r"]) == (0.5, 4.0)
+
+
+def test_k_r_divides_k_cam(client: TestClient, d200: dict[str, Any]) -> None:
+    d200["lens"]["k_r"] = 2.0
+    camera = client.post("/cameras", json=d200).json()
+    assert camera["k_cam_px"] == pytest.approx(thin_lens.k_cam(35e-3, 2.8, 2.0, 6.05e-6, 645 / 3872, 2.0))
+    assert camera["k_r"] == 2.0
+
+
+def test_intrinsics_and_description_come_back_as_sent(client: TestClient, phone: dict[str, Any]) -> None:
+    phone["intrinsics"] = {"fx_px": 3000, "fy_px": 3001.5, "cx_px": 2040, "cy_px": 1536.5}
+    phone["intrinsics"]["distortion"] = [0.1, -0.2, 0, 0, 0.01]
+    phone["description"] = "Größe 1:1, 👍"
+    client.post("/cameras", json=phone)
+    camera = client.get("/cameras/pixel7-wide").json()
+    assert camera["intrinsics"] == phone["intrinsics"]
+    assert camera["description"] == phone["description"]
+    assert camera["fx_px"] == 3000
+
+
+def test_a_taken_name_is_a_conflict(client: TestClient, d200: dict[str, Any]) -> None:
+    client.post("/cameras", json=d200)
+    answer = client.post("/cameras", json=d200)
+    assert answer.status_code == 409
+    assert answer.headers["content-type"] == PROBLEM
+    assert "PUT /cameras/d200" in answer.json()["detail"]
+
+
+def test_put_makes_a_new_revision(client: TestClient, d200: dict[str, Any]) -> None:
+    first = client.post("/cameras", json=d200).json()
+    d200["focus_distance_m"] = 1.0
+    answer = client.put("/cameras/d200", json=d200)
+    assert answer.status_code == 200
+    assert answer.headers["etag"] == '"2"'
+    second = answer.json()
+    assert (second["revision"], second["focus_distance_m"]) == (2, 1.0)
+    assert second["k_cam_px"] > 2 * first["k_cam_px"]
+    assert second["created_at"] == first["created_at"]
+    assert second["updated_at"] > first["updated_at"]
+
+
+def test_put_replaces_the_whole(client: TestClient, d200: dict[str, Any], phone: dict[str, Any]) -> None:
+    client.post("/cameras", json={**d200, "gamma_px": 0.9, "description": "before"})
+    del phone["name"], phone["gamma_px"]
+    camera = client.put("/cameras/d200", json=phone).json()
+    assert (camera["source"], camera["lens"], camera["description"]) == ("given", None, None)
+    assert camera["gamma_px"] == 0.5
+
+
+def test_put_needs_an_existing_camera_of_that_name(client: TestClient, d200: dict[str, Any]) -> None:
+    assert client.put("/cameras/d200", json=d200).status_code == 404
+    client.post("/cameras", json=d200)
+    answer = client.put("/cameras/d200", json={**d200, "name": "other"})
+    assert answer.status_code == 422
+    assert answer.json()["errors"][0]["pointer"] == "#/name"
+
+
+@pytest.mark.parametrize("tag", ['"1"', "*", '"7", "1"'])
+def test_if_match_lets_the_known_revision_pass(client: TestClient, d200: dict[str, Any], tag: str) -> None:
+    client.post("/cameras", json=d200)
+    assert client.put("/cameras/d200", json=d200, headers={"If-Match": tag}).status_code == 200
+
+
+@pytest.mark.parametrize("tag", ['"2"', 'W/"1"', "1", '"x"', ""])
+@pytest.mark.parametrize("method", ["PUT", "DELETE"])
+def test_if_match_holds_back_what_knows_another_revision(
+    client: TestClient, d200: dict[str, Any], tag: str, method: str
+) -> None:
+    client.post("/cameras", json=d200)
+    body = {"json": d200} if method == "PUT" else {}
+    answer = client.request(method, "/cameras/d200", headers={"If-Match": tag}, **body)
+    assert answer.status_code == 412
+    assert client.get("/cameras/d200").json()["revision"] == 1
+
+
+def test_a_deleted_name_is_free_and_goes_on_counting(client: TestClient, d200: dict[str, Any]) -> None:
+    client.post("/cameras", json=d200)
+    answer = client.delete("/cameras/d200")
+    assert (answer.status_code, answer.content) == (204, b"")
+    assert client.get("/cameras/d200").status_code == 404
+    assert client.delete("/cameras/d200").status_code == 404
+    assert client.get("/cameras").json()["items"] == []
+    again = client.post("/cameras", json=d200)
+    assert (again.status_code, again.json()["revision"]) == (201, 2)
+
+
+def test_listing_goes_through_every_camera_once(client: TestClient, phone: dict[str, Any]) -> None:
+    names = sorted(f"camera-{number}" for number in range(7))
+    for name in reversed(names):
+        client.post("/cameras", json={**phone, "name": name})
+    seen: list[str] = []
+    query: dict[str, str] = {"limit": "3"}
+    for _ in range(3):
+        page = client.get("/cameras", params=query).json()
+        seen += [camera["name"] for camera in page["items"]]
+        query["cursor"] = page["next_cursor"]
+    assert seen == names
+    assert page["next_cursor"] is None
+
+
+@pytest.mark.parametrize("query", ["cursor=nonsense", "cursor=", "cursor=%00", "limit=0", "limit=x", "limit=201"])
+def test_a_bad_page_is_refused(client: TestClient, query: str) -> None:
+    answer = client.get(f"/cameras?{query}")
+    assert answer.status_code == 422
+    assert answer.json()["errors"][0]["pointer"] == query.partition("=")[0]
+
+
+def test_the_curve_is_the_thin_lens(client: TestClient, phone: dict[str, Any]) -> None:
+    client.post("/cameras", json=phone)
+    curve = client.get("/cameras/pixel7-wide/curve?near_m=1&far_m=4&points=4").json()
+    assert (curve["camera"], curve["revision"], curve["focus_distance_m"]) == ("pixel7-wide", 1, 2.0)
+    assert [point["depth_m"] for point in curve["points"]] == [1, 2, 3, 4]
+    assert [point["defocus_px"] for point in curve["points"]] == pytest.approx([1.31, 0, 1.31 / 3, 1.31 / 2])
+    assert curve["points"][0]["blur_px"] == pytest.approx(math.hypot(1.31, 0.6))
+    assert curve["points"][1]["blur_px"] == pytest.approx(0.6)
+    assert curve["points"][3]["depth_error_m"] == pytest.approx(16 / (2 * 1.31) * 0.25)
+
+
+def test_the_curve_spans_the_focus_by_default(client: TestClient, phone: dict[str, Any]) -> None:
+    client.post("/cameras", json=phone)
+    points = client.get("/cameras/pixel7-wide/curve").json()["points"]
+    assert points[0]["depth_m"] < 2 < points[-1]["depth_m"]
+    beyond = client.get("/cameras/pixel7-wide/curve?near_m=50").json()["points"]
+    assert (beyond[0]["depth_m"], len(beyond)) == (50, 101)
+
+
+@pytest.mark.parametrize(
+    "query",
+    ["near_m=2&far_m=1", "near_m=1&far_m=1", "near_m=0", "far_m=-1", "near_m=nan", "far_m=inf", "points=1"],
+)
+def test_a_bad_curve_is_refused(client: TestClient, phone: dict[str, Any], query: str) -> None:
+    client.post("/cameras", json=phone)
+    answer = client.get(f"/cameras/pixel7-wide/curve?{query}")
+    assert answer.status_code == 422
+    assert answer.json()["errors"]
+
+
+def test_both_or_neither_of_k_cam_and_lens_is_refused(client: TestClient, d200: dict[str, Any]) -> None:
+    both = client.post("/cameras", json={**d200, "k_cam_px": 3.0})
+    del d200["lens"]
+    neither = client.post("/cameras", json=d200)
+    for answer in (both, neither):
+        assert answer.status_code == 422
+        assert {fault["pointer"] for fault in answer.json()["errors"]} == {"#/k_cam_px", "#/lens"}
+
+
+@pytest.mark.parametrize("focal_length_mm", [2000, 2000.0, 5000])
+def test_a_lens_longer_than_its_focus_distance_is_refused(
+    client: TestClient, d200: dict[str, Any], focal_length_mm: float
+) -> None:
+    d200["lens"]["focal_length_mm"] = focal_length_mm
+    answer = client.post("/cameras", json=d200)
+    assert answer.status_code == 422
+    assert answer.json()["errors"][0]["pointer"] == "#/lens/focal_length_mm"
+    assert "cannot focus at 2 m" in answer.json()["detail"]
+
+
+@pytest.mark.parametrize("place", ["lens", "body"])
+@pytest.mark.parametrize("name", ["focal_length_35mm", "focal_length_in_35mm_film"])
+def test_an_equivalent_focal_length_is_explained(
+    client: TestClient, d200: dict[str, Any], place: str, name: str
+) -> None:
+    (d200["lens"] if place == "lens" else d200)[name] = 52
+    answer = client.post("/cameras", json=d200)
+    assert answer.status_code == 422
+    fault = answer.json()["errors"][0]
+    assert fault["pointer"] == (f"#/lens/{name}" if place == "lens" else f"#/{name}")
+    assert "35-mm-equivalent" in fault["detail"]
+    assert "focal_length_mm" in fault["detail"]
+
+
+NUMBERS = ["image_width_px", "image_height_px", "focus_distance_m", "k_cam_px"]
+LENS_NUMBERS = ["focal_length_mm", "f_number", "pixel_pitch_um", "sensor_width_px", "k_r"]
+BAD = [
+    "0",
+    "-1",
+    "NaN",
+    "Infinity",
+    "-Infinity",
+    "1e400",
+    '"2"',
+    "true",
+    "[]",
+    "1" + "0" * 30,
+    "1" + "0" * 5000,
+]
+
+
+@pytest.mark.parametrize("bad", BAD)
+@pytest.mark.parametrize("name", NUMBERS)
+def test_no_number_of_a_camera_may_be_nonsense(client: TestClient, phone: dict[str, Any], name: str, bad: str) -> None:
+    body = _json_with(phone, name, bad)
+    answer = client.post("/cameras", content=body, headers={"Content-Type": "application/json"})
+    assert answer.status_code == 422
+    assert answer.headers["content-type"] == PROBLEM
+    if len(bad) < 1000:
+        assert answer.json()["errors"][0]["pointer"] == f"#/{name}"
+
+
+@pytest.mark.parametrize("bad", BAD)
+@pytest.mark.parametrize("name", LENS_NUMBERS)
+def test_no_number_of_a_lens_may_be_nonsense(client: TestClient, d200: dict[str, Any], name: str, bad: str) -> None:
+    lens = _json_with(d200["lens"], name, bad)
+    body = _json_with(d200, "lens", lens)
+    answer = client.post("/cameras", content=body, headers={"Content-Type": "application/json"})
+    assert answer.status_code == 422
+    if len(bad) < 1000:
+        assert answer.json()["errors"][0]["pointer"] == f"#/lens/{name}"
+
+
+@pytest.mark.parametrize("gamma_px", ["-0.1", "NaN", "Infinity"])
+def test_gamma_may_be_zero_and_not_less(client: TestClient, phone: dict[str, Any], gamma_px: str) -> None:
+    body = _json_with(phone, "gamma_px", gamma_px)
+    answer = client.post("/cameras", content=body, headers={"Content-Type": "application/json"})
+    assert answer.status_code == 422
+    assert client.post("/cameras", json={**phone, "gamma_px": 0}).status_code == 201
+
+
+@pytest.mark.parametrize(
+    ("change", "pointer"),
+    [
+        ({"colour": "black"}, "#/colour"),
+        ({"name": ""}, "#/name"),
+        ({"name": "a/b"}, "#/name"),
+        ({"name": "../x"}, "#/name"),
+        ({"name": "a b"}, "#/name"),
+        ({"name": "d200\n"}, "#/name"),
+        ({"name": "x" * 65}, "#/name"),
+        ({"name": 7}, "#/name"),
+        ({"name": None}, "#/name"),
+        ({"description": "a\x00b"}, "#/description"),
+        ({"description": "x" * 1001}, "#/description"),
+        ({"lens": []}, "#/lens"),
+        ({"intrinsics": {"fx_px": 1, "fy_px": 1, "cx_px": 0, "cy_px": 0, "skew": 0}}, "#/intrinsics/skew"),
+        ({"intrinsics": {"fx_px": 1, "fy_px": 0, "cx_px": 0, "cy_px": 0}}, "#/intrinsics/fy_px"),
+        (
+            {"intrinsics": {"fx_px": 1, "fy_px": 1, "cx_px": 0, "cy_px": 0, "distortion": [1, 2]}},
+            "#/intrinsics/distortion",
+        ),
+        ({"~weird/name": 1}, "#/~0weird~1name"),
+    ],
+)
+def test_a_wrong_field_is_pointed_at(
+    client: TestClient, phone: dict[str, Any], change: dict[str, Any], pointer: str
+) -> None:
+    answer = client.post("/cameras", json={**phone, **change})
+    assert answer.status_code == 422
+    assert answer.json()["errors"][0]["pointer"] == pointer
+
+
+@pytest.mark.parametrize("missing", ["name", "image_width_px", "image_height_px", "focus_distance_m"])
+def test_a_missing_field_is_pointed_at(client: TestClient, phone: dict[str, Any], missing: str) -> None:
+    del phone[missing]
+    answer = client.post("/cameras", json=phone)
+    assert answer.status_code == 422
+    assert answer.json()["errors"] == [{"pointer": f"#/{missing}", "detail": "Field required"}]
+
+
+@pytest.mark.parametrize("name", ["nobody", "%00", "a%20b", "..%2f", "x" * 300, "%ff"])
+def test_an_unknown_camera_is_not_found(client: TestClient, phone: dict[str, Any], name: str) -> None:
+    del phone["name"]
+    for method, path in (("GET", ""), ("DELETE", ""), ("GET", "/curve"), ("PUT", "")):
+        body = {"json": phone} if method == "PUT" else {}
+        answer = client.request(method, f"/cameras/{name}{path}", **body)
+        assert answer.status_code == 404, (method, path)
+        assert answer.headers["content-type"] == PROBLEM
+
+
+def _json_with(fields: dict[str, Any], name: str, raw: str) -> str:
+    """JSON text with one value written as it stands."""
+    parts = {**{key: json.dumps(value) for key, value in fields.items()}, name: raw}
+    return "{" + ", ".join(f"{json.dumps(key)}: {value}" for key, value in parts.items()) + "}"

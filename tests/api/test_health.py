@@ -1,0 +1,68 @@
+"""Health, the model's page, and the rest that is only read."""
+
+import json
+from pathlib import Path
+
+from fastapi import FastAPI
+from starlette.testclient import TestClient
+
+from service.config import Settings
+from service.storage import schema
+
+
+def test_a_started_service_is_live_and_ready(client: TestClient) -> None:
+    assert client.get("/health/live").json() == {"status": "live"}
+    answer = client.get("/health/ready")
+    assert answer.status_code == 200
+    assert answer.json() == {
+        "status": "ready",
+        "model": "oracle-20260101",
+        "database": "writable",
+        "schema": "head",
+    }
+
+
+def test_an_old_schema_is_not_ready(client: TestClient, app: FastAPI) -> None:
+    schema.downgrade(app.state.engine)
+    answer = client.get("/health/ready")
+    assert answer.status_code == 503
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert "camind migrate" in answer.json()["detail"]
+    assert client.get("/health/live").status_code == 200
+
+
+def test_a_database_that_takes_no_writes_is_not_ready(client: TestClient, app: FastAPI) -> None:
+    with app.state.engine.connect() as connection:
+        connection.exec_driver_sql("PRAGMA query_only = ON")
+        connection.rollback()
+    answer = client.get("/health/ready")
+    assert answer.status_code == 503
+    assert answer.json()["type"] == "urn:camind:problem:not-ready"
+
+
+def test_a_model_that_is_not_warm_is_not_ready(client: TestClient, app: FastAPI) -> None:
+    app.state.is_warm = False
+    assert client.get("/health/ready").status_code == 503
+
+
+def test_the_model_shows_its_manifest_and_card(client: TestClient, tiny_model_dir: Path) -> None:
+    answer = client.get("/model").json()
+    assert answer["manifest"] == json.loads((tiny_model_dir / "manifest.json").read_text())
+    assert answer["card"] == (tiny_model_dir / "MODEL_CARD.md").read_text()
+
+
+def test_the_page_and_the_docs_are_there(client: TestClient) -> None:
+    page = client.get("/")
+    assert page.headers["content-type"].startswith("text/html")
+    assert 'href="docs"' in page.text
+    assert client.get("/docs").status_code == 200
+    assert client.get("/openapi.json").json()["info"]["title"] == "camind"
+
+
+def test_a_stopped_service_starts_again_with_its_cameras(app: FastAPI, settings: Settings) -> None:
+    body = {"image_width_px": 4, "image_height_px": 3, "focus_distance_m": 1, "k_cam_px": 2}
+    with TestClient(app) as client:
+        assert client.post("/cameras", json={"name": "kept", **body}).status_code == 201
+    with TestClient(app) as client:
+        assert client.get("/cameras/kept").json()["k_cam_px"] == 2
+    assert (settings.data_dir / "camind.sqlite3").is_file()

@@ -1,0 +1,59 @@
+"""Request ids, the one log event of a request, and what is counted."""
+
+from typing import Any
+
+import pytest
+import structlog
+from starlette.testclient import TestClient
+
+
+@pytest.mark.parametrize("given", ["abc", "0f8b-4.2_1:x", "a" * 128])
+def test_a_sane_request_id_is_kept(client: TestClient, given: str) -> None:
+    assert client.get("/health/live", headers={"X-Request-Id": given}).headers["x-request-id"] == given
+
+
+@pytest.mark.parametrize("given", ["", "a b", "a\tb", "x" * 129, "<script>"])
+def test_any_other_request_id_is_replaced(client: TestClient, given: str) -> None:
+    made = client.get("/nothing", headers={"X-Request-Id": given}).headers["x-request-id"]
+    assert made != given
+    assert len(made) == 32
+
+
+def test_requests_have_ids_of_their_own(client: TestClient) -> None:
+    made = {client.get("/health/live").headers["x-request-id"] for _ in range(3)}
+    assert len(made) == 3
+
+
+def test_a_request_is_one_event(client: TestClient, phone: dict[str, Any]) -> None:
+    client.post("/cameras", json=phone)
+    with structlog.testing.capture_logs(processors=[structlog.contextvars.merge_contextvars]) as events:
+        client.get("/cameras/pixel7-wide", headers={"X-Request-Id": "abc"})
+        client.head("/cameras/pixel7-wide/curve")
+        client.get("/nothing")
+        client.post("/depth?camera=pixel7-wide", content=b"x", headers={"Content-Type": "text/plain"})
+    assert [(event["method"], event["path"], event["status"]) for event in events] == [
+        ("GET", "/cameras/{name}", 200),
+        ("HEAD", "/cameras/{name}/curve", 200),
+        ("GET", None, 404),
+        ("POST", "/depth", 415),
+    ]
+    assert [event.get("camera") for event in events] == ["pixel7-wide", "pixel7-wide", None, "pixel7-wide"]
+    assert events[0]["request_id"] == "abc"
+    assert events[0]["duration_ms"] > 0
+
+
+def test_metrics_count_by_path_template(client: TestClient, phone: dict[str, Any]) -> None:
+    client.post("/cameras", json=phone)
+    for name in ("pixel7-wide", "a", "b"):
+        client.get(f"/cameras/{name}")
+    client.get("/wp-admin")
+    client.request("BREW", "/coffee")
+    answer = client.get("/metrics")
+    assert answer.headers["content-type"].startswith("text/plain")
+    lines = answer.text.splitlines()
+    assert 'camind_requests_total{method="GET",path="/cameras/{name}",status="200"} 1.0' in lines
+    assert 'camind_requests_total{method="GET",path="/cameras/{name}",status="404"} 2.0' in lines
+    assert 'camind_requests_total{method="GET",path="unmatched",status="404"} 1.0' in lines
+    assert 'camind_requests_total{method="other",path="unmatched",status="404"} 1.0' in lines
+    assert "wp-admin" not in answer.text
+    assert "process_resident_memory_bytes" in answer.text
