@@ -1,8 +1,9 @@
 """The model card: what the pair is for, what it was trained on, what it scores. Written, never edited."""
 
 from collections.abc import Mapping
+from pathlib import Path
 
-from service.inference.artifact import Interval, Ranges, Training
+from service.inference.artifact import Interval, Ranges, Training, load_model_folder, sha256_of, write_manifest
 
 SCORES_HEADING = "## Scores"
 
@@ -53,3 +54,13 @@ def with_scores(card: str, tables: Mapping[str, str], command: str) -> str:
     head = card.split(SCORES_HEADING)[0]
     body = "\n\n".join(f"### {title}\n\n{table}" for title, table in tables.items())
     return f"{head}{SCORES_HEADING}\n\nPrinted by `{command}`.\n\n{body}\n"
+
+
+def record_scores(model: Path, scores: Mapping[str, float], tables: Mapping[str, str], command: str) -> None:
+    """Write scores into a model folder: into the card, then, last, into the manifest that vouches for it."""
+    folder = load_model_folder(model)
+    card = folder.path / folder.manifest.card.file
+    text = with_scores(folder.card(), tables, command)
+    card.write_text(text)
+    vouched = folder.manifest.card.model_copy(update={"sha256": sha256_of(card)})
+    write_manifest(folder.path, folder.manifest.model_copy(update={"scores": dict(scores), "card": vouched}))

@@ -1,0 +1,127 @@
+"""What training adds to the command ``camind``: train, export, verify, evaluate."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+if TYPE_CHECKING:  # importing torch takes seconds; a command that needs it does so itself
+    from model_export.evaluate import Report
+    from model_export.verify import Difference
+
+commands = typer.Typer(help="Train, export and score models.")
+
+Kind = Annotated[str, typer.Option(help="compact (ours) or paper")]
+Model = Annotated[Path, typer.Option(help="model folder", file_okay=False)]
+Textures = Annotated[Path, typer.Option(help="folder of pictures with LICENCES.md", exists=True, file_okay=False)]
+Checkpoint = Annotated[Path, typer.Option(help="checkpoint file of a run", exists=True, dir_okay=False)]
+
+DEFAULT_MODEL = Path(__file__).parents[1] / "service" / "models"
+
+
+def _fail(message: str) -> typer.Exit:
+    typer.secho(message, err=True, fg="red")
+    return typer.Exit(1)
+
+
+@commands.command()
+def train(
+    run: Annotated[Path, typer.Option(help="folder of the run: its checkpoint lies there and is gone on from")],
+    textures: Textures,
+    kind: Kind = "compact",
+    steps: Annotated[int, typer.Option(min=1, help="batches in the whole run")] = 7_000,
+    seed: Annotated[int, typer.Option(min=0, help="the same seed is the same run")] = 1,
+    workers: Annotated[int, typer.Option(min=0, max=64, help="processes that draw scenes")] = 1,
+    device: Annotated[str, typer.Option(help="torch device")] = "cpu",
+) -> None:
+    """Train a pair of networks on procedural scenes; stop and start it as you like."""
+    from model_export.config import TrainConfig
+    from model_export.train import train as run_training
+
+    if kind not in {"compact", "paper"}:
+        raise _fail(f"--kind is compact or paper, not {kind}")
+    config = TrainConfig(kind="paper" if kind == "paper" else "compact", steps=steps, seed=seed)
+    try:
+        path = run_training(config, textures, run, workers=workers, device=device)
+    except FileNotFoundError as exc:
+        raise _fail(str(exc)) from exc
+    typer.echo(path)
+
+
+@commands.command()
+def export(
+    checkpoint: Checkpoint,
+    textures: Textures,
+    out: Annotated[Path, typer.Option(help="model folder to write")],
+    name: Annotated[str | None, typer.Option(help="name of the model")] = None,
+) -> None:
+    """Write a checkpoint as a model folder: two ONNX graphs, card and manifest."""
+    from model_export.export import export_checkpoint
+
+    manifest = export_checkpoint(checkpoint, textures, out, name)
+    typer.echo(f"{manifest.name} in {out}")
+
+
+@commands.command()
+def verify(checkpoint: Checkpoint, model: Model = DEFAULT_MODEL) -> None:
+    """Compare torch with ONNX Runtime on three sizes; fails above 1e-3 relative."""
+    from model_export.verify import TOLERANCE, verify_checkpoint
+
+    differences = verify_checkpoint(checkpoint, model)
+    Console().print(_differences(differences))
+    worst = max(d.relative for d in differences)
+    if not worst <= TOLERANCE:
+        raise _fail(f"largest relative difference {worst:.1e} is above {TOLERANCE:.0e}")
+
+
+def _differences(differences: "list[Difference]") -> Table:
+    table = Table("size", "output", "largest relative difference")
+    for d in differences:
+        table.add_row(f"{d.width_px}x{d.height_px}", d.output, f"{d.relative:.1e}")
+    return table
+
+
+@commands.command()
+def evaluate(
+    data: Annotated[
+        Path, typer.Option(help="folder with rgbd/, tabletop/, d200/ (what is there is used)", exists=True)
+    ],
+    model: Model = DEFAULT_MODEL,
+    quick: Annotated[bool, typer.Option(help="a few pictures of each set")] = False,
+    out: Annotated[Path | None, typer.Option(help="folder for report.json and sample maps")] = None,
+    update_card: Annotated[bool, typer.Option(help="write the scores into the model's card and manifest")] = False,
+) -> None:
+    """Score a model on pictures that no training saw, beside the best constant depth of each picture."""
+    from model_export.evaluate import evaluate as run_evaluation
+
+    console = Console(stderr=True)
+    with console.status("loading") as status:
+        report = run_evaluation(model, data, quick=quick, on_progress=status.update)
+    stdout = Console()
+    for table in _tables(report):
+        stdout.print(table)
+    if out is not None:
+        _write_report(report, out)
+    if update_card:
+        from model_export.card import record_scores
+
+        record_scores(model, report.scores(), report.markdown(), "camind evaluate --data DATA")
+
+
+def _tables(report: "Report") -> list[Table]:
+    tables = []
+    for title, (head, rows) in report.tables().items():
+        table = Table(*head, title=title)
+        for row in rows:
+            table.add_row(*row)
+        tables.append(table)
+    return tables
+
+
+def _write_report(report: "Report", out: Path) -> None:
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "report.json").write_text(json.dumps(report.as_dict(), indent=2) + "\n")
+    report.write_samples(out)
