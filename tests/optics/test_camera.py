@@ -1,0 +1,82 @@
+"""The camera: bounds, resizing, refocusing."""
+
+import math
+
+import pytest
+
+from service.optics.camera import Camera, Intrinsics, Lens
+
+D200 = Lens(focal_length_mm=35, f_number=2.8, pixel_pitch_um=6.05, sensor_width_px=3872)
+
+
+def camera(**changes: float) -> Camera:
+    values = {"image_width_px": 640, "image_height_px": 480, "focus_distance_m": 2.0, "k_cam_px": 3.81} | changes
+    return Camera(**values)  # type: ignore[arg-type]
+
+
+def test_lens_specs_give_k_cam_at_the_images_width() -> None:
+    assert D200.k_cam_px(2.0, 645) == pytest.approx(1.5324, rel=1e-3)
+    assert D200.k_cam_px(2.0, 3872) == pytest.approx(D200.k_cam_px(2.0, 645) * 3872 / 645)
+
+
+@pytest.mark.parametrize("name", ["image_width_px", "image_height_px", "focus_distance_m", "k_cam_px"])
+@pytest.mark.parametrize("value", [0, -1, math.nan, math.inf])
+def test_out_of_bounds_is_refused_by_name(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=name):
+        camera(**{name: value})
+
+
+@pytest.mark.parametrize("gamma", [-0.1, math.nan, math.inf])
+def test_gamma_is_zero_or_more(gamma: float) -> None:
+    with pytest.raises(ValueError, match="gamma_px"):
+        camera(gamma_px=gamma)
+
+
+def test_focal_length_is_shorter_than_focus() -> None:
+    with pytest.raises(ValueError, match="focal_length_m"):
+        camera(focal_length_m=2.0)
+
+
+def test_resizing_scales_blur_and_leaves_depth() -> None:
+    half = camera().resized(320, 240)
+    assert half.k_cam_px == pytest.approx(3.81 / 2)
+    assert half.gamma_px == pytest.approx(0.25)
+    assert half.blur_px(1.0) == pytest.approx(camera().blur_px(1.0) / 2)
+
+
+def test_resizing_there_and_back_is_nothing() -> None:
+    there = Camera(640, 480, 2.0, 3.81, intrinsics=Intrinsics(500, 510, 319.5, 239.5, (0.1, -0.2)))
+    back = there.resized(320, 240).resized(640, 480)
+    assert back.k_cam_px == pytest.approx(there.k_cam_px)
+    assert back.intrinsics is not None
+    assert back.intrinsics.cx_px == pytest.approx(319.5)
+    assert back.intrinsics.distortion == (0.1, -0.2)
+
+
+def test_the_centre_of_the_image_stays_its_centre() -> None:
+    scaled = Intrinsics(500, 500, 319.5, 239.5).scaled(0.25, 0.25)
+    assert (scaled.cx_px, scaled.cy_px) == pytest.approx((79.5, 59.5))
+
+
+def test_the_same_frame_is_told_from_a_crop() -> None:
+    assert camera().is_same_frame(320, 240)
+    assert camera().is_same_frame(161, 121)
+    assert not camera().is_same_frame(640, 427)
+    assert not camera().is_same_frame(480, 640)
+
+
+def test_refocusing_follows_the_lens() -> None:
+    known = Camera(645, 432, 2.0, D200.k_cam_px(2.0, 645), focal_length_m=0.035)
+    assert known.focused_at(1.0).k_cam_px == pytest.approx(D200.k_cam_px(1.0, 645))
+    with pytest.raises(ValueError, match="focal length"):
+        known.focused_at(0.03)
+
+
+def test_refocusing_without_a_focal_length_takes_it_as_short() -> None:
+    assert camera().focused_at(1.0).k_cam_px == pytest.approx(2 * 3.81)
+
+
+def test_range_ends_where_a_quarter_pixel_is_ten_percent() -> None:
+    near, far = camera().range_m
+    assert near == 0
+    assert far == pytest.approx(0.1 * 2.0 * 3.81 / 0.25)

@@ -1,0 +1,131 @@
+"""The physics: round trips, limits, gradients, and one answer from float, NumPy and torch."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.optics import thin_lens
+
+focus = st.floats(0.1, 20.0)
+k_cams = st.floats(0.05, 300.0)
+gammas = st.floats(0.0, 3.0)
+near_ratio = st.floats(0.05, 0.98)
+far_ratio = st.floats(1.02, 20.0)
+
+
+@given(focus, k_cams, gammas, near_ratio)
+def test_near_depth_survives_the_trip_through_blur(s1: float, k: float, gamma: float, ratio: float) -> None:
+    blur = thin_lens.blur_at_depth(s1 * ratio, s1, k, gamma)
+    x = thin_lens.relative_defocus_from_blur(blur, gamma, k)
+    assert thin_lens.depth_near(x, s1) == pytest.approx(s1 * ratio, rel=1e-4)
+
+
+@given(focus, k_cams, gammas, far_ratio)
+def test_far_depth_survives_the_trip_through_blur(s1: float, k: float, gamma: float, ratio: float) -> None:
+    blur = thin_lens.blur_at_depth(s1 * ratio, s1, k, gamma)
+    x = thin_lens.relative_defocus_from_blur(blur, gamma, k)
+    assert thin_lens.depth_far(x, s1) == pytest.approx(s1 * ratio, rel=1e-2)
+
+
+@given(focus, k_cams, gammas)
+def test_focus_shows_gamma_alone(s1: float, k: float, gamma: float) -> None:
+    assert thin_lens.defocus_at_depth(s1, s1, k) == 0
+    assert thin_lens.blur_at_depth(s1, s1, k, gamma) == pytest.approx(gamma)
+
+
+@given(focus, st.floats(0.0001, 1e6))
+def test_relative_defocus_reaches_one_only_near(s1: float, ratio: float) -> None:
+    x = thin_lens.relative_defocus(s1 * ratio, s1)
+    if x >= 1:
+        assert ratio <= 0.5
+    if ratio > 1:
+        assert x < 1
+
+
+def test_signed_defocus_is_negative_nearer_than_focus() -> None:
+    assert thin_lens.signed_defocus(1.0, 2.0) < 0 == thin_lens.signed_defocus(2.0, 2.0)
+    assert 0 < thin_lens.signed_defocus(400.0, 2.0) < 1
+
+
+def test_blur_below_gamma_is_focus() -> None:
+    assert thin_lens.defocus_from_blur(0.3, 0.5) == 0
+
+
+@given(focus, k_cams, st.floats(0.1, 10))
+def test_width_and_blur_scale_alike_and_depth_stays(s1: float, k: float, ratio: float) -> None:
+    blur = thin_lens.blur_at_depth(0.7 * s1, s1, k, 0.5)
+    x = thin_lens.relative_defocus_from_blur(blur * ratio, 0.5 * ratio, k * ratio)
+    assert thin_lens.depth_near(x, s1) == pytest.approx(0.7 * s1, rel=1e-4)
+
+
+@given(st.floats(0.5, 5), st.floats(0.5, 5))
+def test_moving_the_focus_is_computing_k_cam_there(old: float, new: float) -> None:
+    before = thin_lens.k_cam(0.05, 1.8, old, 4e-6)
+    moved = thin_lens.k_cam_at_focus(before, 0.05, old, new)
+    assert moved == pytest.approx(thin_lens.k_cam(0.05, 1.8, new, 4e-6), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "call", [lambda: thin_lens.k_cam(0.05, 2, 0.05, 4e-6), lambda: thin_lens.k_cam_at_focus(1, 2, 3, 2)]
+)
+def test_a_lens_cannot_focus_within_its_focal_length(call: Callable[[], float]) -> None:
+    with pytest.raises(ValueError, match="focal length"):
+        call()
+
+
+def test_depth_error_is_the_derivative_of_depth() -> None:
+    s1, k, depth, step = 2.0, 3.81, 1.2, 1e-6
+    x = thin_lens.relative_defocus(depth, s1)
+    moved = thin_lens.depth_near(x + step / k, s1)
+    assert thin_lens.depth_error(depth, s1, k, 1.0) == pytest.approx(abs(moved - depth) / step, rel=1e-4)
+
+
+def test_farthest_depth_is_where_the_error_meets_the_limit() -> None:
+    far = thin_lens.farthest_depth(2.0, 1.5, 0.25, 0.1)
+    assert thin_lens.depth_error(far, 2.0, 1.5, 0.25) / far == pytest.approx(0.1)
+
+
+def test_spread_is_finite_in_focus_and_shrinks_with_certainty() -> None:
+    in_focus = thin_lens.relative_defocus_spread(0.5, 0.1, 0.5, 2.0)
+    assert 0 < in_focus < 1
+    assert thin_lens.relative_defocus_spread(4.0, 0.05, 0.5, 2.0) < thin_lens.relative_defocus_spread(
+        4.0, 0.1, 0.5, 2.0
+    )
+
+
+FORMULAS: list[Callable[[Any], Any]] = [
+    lambda z: thin_lens.relative_defocus(z, 2.0),
+    lambda z: thin_lens.signed_defocus(z, 2.0),
+    lambda z: thin_lens.blur_at_depth(z, 2.0, 3.81, 0.5),
+    lambda z: thin_lens.relative_defocus_from_blur(z, 0.2, 3.81),
+    lambda z: thin_lens.depth_near(z, 2.0),
+    lambda z: thin_lens.depth_far(z, 2.0),
+    lambda z: thin_lens.depth_error(z, 2.0, 3.81, 0.25),
+    lambda z: thin_lens.relative_defocus_spread(z, 0.1 + 0 * z, 0.2, 3.81),
+]
+POINTS = [0.3, 0.7, 1.3, 2.5, 4.0]
+
+
+@pytest.mark.parametrize("formula", FORMULAS)
+def test_float_numpy_and_torch_agree(formula: Callable[[Any], Any]) -> None:
+    floats = [formula(z) for z in POINTS]
+    np.testing.assert_allclose(formula(np.array(POINTS)), floats, rtol=1e-12)
+    np.testing.assert_allclose(formula(torch.tensor(POINTS, dtype=torch.float64)).numpy(), floats, rtol=1e-12)
+
+
+@pytest.mark.parametrize("formula", FORMULAS)
+def test_gradients_are_those_of_finite_differences(formula: Callable[[Any], Any]) -> None:
+    points = torch.tensor(POINTS, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(formula, (points,))
+
+
+def test_gradient_at_focus_is_finite_with_a_floor() -> None:
+    blur = torch.tensor([0.5], dtype=torch.float64, requires_grad=True)
+    thin_lens.defocus_from_blur(blur, 0.5, floor_px=0.05).sum().backward()  # type: ignore[no-untyped-call]
+    assert blur.grad is not None
+    assert torch.isfinite(blur.grad).all()
