@@ -78,8 +78,7 @@ router = APIRouter(tags=["depth"])
             "model": DepthRead,
             "description": "The depth map, of the size of the upright photograph",
             "content": {
-                media_type: {"schema": {"type": "string", "format": "binary"}}
-                for media_type in MEDIA_TYPES.values()
+                media_type: {"schema": {"type": "string", "format": "binary"}} for media_type in MEDIA_TYPES.values()
             },
             "headers": {
                 name: {"description": meaning, "schema": {"type": "string"}}

@@ -26,9 +26,7 @@ MANIFEST_FILE = "manifest.json"
 FEATURES_PREFIX = "features"
 BLUR_INPUTS = frozenset({"image"})
 BLUR_OUTPUTS = frozenset({"blur_px", "blur_log_error"})
-DEPTH_INPUTS = frozenset(
-    {"relative_defocus", "relative_defocus_spread", "focus_distance_m", "focal_length_px", "side"}
-)
+DEPTH_INPUTS = frozenset({"relative_defocus", "relative_defocus_spread", "focus_distance_m", "focal_length_px", "side"})
 DEPTH_OUTPUTS = frozenset({"log_ratio_near", "log_ratio_far", "p_near", "log_scale"})
 
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")]
@@ -243,6 +241,4 @@ def _verify(folder: Path, name: str, sha256: str) -> None:
     except OSError as exc:
         raise ModelFolderError(f"{path}, which the manifest names, cannot be read: {exc.strerror}") from exc
     if found != sha256:
-        raise ModelFolderError(
-            f"{path} is not the file the manifest vouches for: sha256 {found}, not {sha256}"
-        )
+        raise ModelFolderError(f"{path} is not the file the manifest vouches for: sha256 {found}, not {sha256}")

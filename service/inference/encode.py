@@ -114,9 +114,7 @@ def encode_ply(answer: DepthMap, rgb: NDArray[np.uint8]) -> Encoded:
     """
     matrix = camera_matrix(answer)
     if not np.isfinite(matrix).all():
-        raise BadRequest(
-            "A point cloud needs the camera's focal length: register it with intrinsics or lens."
-        )
+        raise BadRequest("A point cloud needs the camera's focal length: register it with intrinsics or lens.")
     v, u = np.nonzero(answer.valid)
     z = answer.depth_m[v, u]
     points = np.empty(

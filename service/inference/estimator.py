@@ -133,9 +133,7 @@ def _outside(name: str, value: float, trained: Interval) -> list[str]:
     # a copy's size is a whole number of pixels, so its constants may miss the range by a rounding
     if trained.low * 0.99 <= value <= trained.high * 1.01:
         return []
-    return [
-        f"{name} is {value:.4g}, outside {trained.low:g} to {trained.high:g} that the model was trained on"
-    ]
+    return [f"{name} is {value:.4g}, outside {trained.low:g} to {trained.high:g} that the model was trained on"]
 
 
 def _sparseness(valid: NDArray[np.bool_]) -> list[str]:

@@ -65,9 +65,7 @@ def read_header(data: bytes) -> Header:
     except (struct.error, IndexError) as exc:
         raise cut_off(str(kind)) from exc
     if header.width_px < 1 or header.height_px < 1:
-        raise InvalidImage(
-            f"The {header.kind} file states a size of {header.width_px}x{header.height_px} pixels."
-        )
+        raise InvalidImage(f"The {header.kind} file states a size of {header.width_px}x{header.height_px} pixels.")
     return header
 
 
@@ -133,9 +131,7 @@ def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
         end = at + 8 + length
         (checksum,) = struct.unpack_from(">I", data, end)
         if zlib.crc32(memoryview(data)[at + 4 : end]) != checksum:
-            raise InvalidImage(
-                f"The png file is damaged: its {name.decode('latin-1')!r} part fails its checksum."
-            )
+            raise InvalidImage(f"The png file is damaged: its {name.decode('latin-1')!r} part fails its checksum.")
         yield name, data[at + 8 : end] if name in (b"IHDR", b"eXIf") else b""
         at = end + 4
 

@@ -67,9 +67,7 @@ class Photograph:
         return int(self.rgb.shape[0])
 
 
-def read_photograph(
-    data: bytes, media_type: str | None = None, limits: ImageLimits | None = None
-) -> Photograph:
+def read_photograph(data: bytes, media_type: str | None = None, limits: ImageLimits | None = None) -> Photograph:
     """Decode a photograph; the bytes decide its kind, whatever ``media_type`` declares.
 
     Raises ``InvalidImage`` (empty, cut off, damaged), ``TooLarge`` (before decoding) and ``UnsupportedKind``

@@ -92,9 +92,7 @@ def _corrected(seen: RawMaps, camera: Camera, side: Side) -> RawMaps:
     return {
         **{name: value for name, value in seen.items() if name not in ("blur_px", "blur_log_error")},
         "relative_defocus": thin_lens.relative_defocus_from_blur(blur_px, gamma_px, k_cam_px),
-        "relative_defocus_spread": thin_lens.relative_defocus_spread(
-            blur_px, relative_error, gamma_px, k_cam_px
-        ),
+        "relative_defocus_spread": thin_lens.relative_defocus_spread(blur_px, relative_error, gamma_px, k_cam_px),
         "focus_distance_m": np.array([camera.focus_distance_m], np.float32),
         "focal_length_px": np.array([focal_length_px], np.float32),
         "side": np.array([SIDE_HINTS[side]], np.float32),

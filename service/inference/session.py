@@ -1,7 +1,8 @@
 """onnxruntime, and the only importer of it.
 
-The memory arena is off: it keeps the largest request's buffers for ever, the system's allocator gives them
-back. A run asked to stop stops inside the graph, between two of its operators.
+The memory arena is off. Over pictures of many sizes it kept 520 MB for ever where 158 MB were kept without it,
+for 5 % of the time (compact pair, up to 1.5 megapixels).
+A run asked to stop stops inside the graph, between two of its operators.
 """
 
 from collections.abc import Mapping
