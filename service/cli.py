@@ -106,10 +106,7 @@ def list_cameras() -> None:
     def line(record: CameraRecord) -> str:
         camera = record.camera
         size = f"{camera.image_width_px}x{camera.image_height_px}"
-        return (
-            f"{record.name}\tr{record.revision}\t{camera.k_cam_px:.4g} px"
-            f"\t{camera.focus_distance_m:g} m\t{size}"
-        )
+        return f"{record.name}\tr{record.revision}\t{camera.k_cam_px:.4g} px\t{camera.focus_distance_m:g} m\t{size}"
 
     with _plain_failures():
         cameras, after, has_more = Cameras(_ready_engine()), None, True

@@ -35,9 +35,7 @@ def default_data_dir() -> Path:
 class Settings(BaseSettings):
     """Everything an operator can choose. Durations in seconds, sizes in bytes, images in pixels."""
 
-    model_config = SettingsConfigDict(
-        env_prefix=ENV_PREFIX, frozen=True, extra="forbid", env_ignore_empty=True
-    )
+    model_config = SettingsConfigDict(env_prefix=ENV_PREFIX, frozen=True, extra="forbid", env_ignore_empty=True)
 
     data_dir: Annotated[Path, Field(description="Folder of the database and of the service's files")] = Field(
         default_factory=default_data_dir
@@ -45,30 +43,22 @@ class Settings(BaseSettings):
     database_url: Annotated[
         str, Field(description="SQLite or PostgreSQL (postgresql+psycopg://); empty: a file in data_dir")
     ] = ""
-    model_dir: Annotated[Path, Field(description="Model folder to serve; default: the shipped model")] = (
-        SHIPPED_MODEL
-    )
+    model_dir: Annotated[Path, Field(description="Model folder to serve; default: the shipped model")] = SHIPPED_MODEL
 
-    host: Annotated[str, Field(min_length=1, description="Address to bind; default: this machine only")] = (
-        "127.0.0.1"
-    )
+    host: Annotated[str, Field(min_length=1, description="Address to bind; default: this machine only")] = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535, description="TCP port; 0 lets the system choose")] = 8000
 
     workers: Annotated[int, Field(ge=0, le=64, description="Images worked on at a time; 0: cores / 2")] = 0
-    intra_op_threads: Annotated[
-        int, Field(ge=0, le=64, description="Threads per image; 0: cores / workers")
-    ] = 0
+    intra_op_threads: Annotated[int, Field(ge=0, le=64, description="Threads per image; 0: cores / workers")] = 0
     queue_size: Annotated[int, Field(ge=0, le=1000, description="Images that may wait for a worker")] = 16
-    deadline_s: Annotated[float, Field(gt=0, le=600, description="Longest wait and work for one image")] = (
-        30.0
-    )
+    deadline_s: Annotated[float, Field(gt=0, le=600, description="Longest wait and work for one image")] = 30.0
 
     max_image_bytes: Annotated[
         int, Field(ge=1_000, le=1_000_000_000, description="Largest request body with an image")
     ] = 40_000_000
-    max_image_pixels: Annotated[
-        int, Field(ge=1_000, le=500_000_000, description="Largest image, width x height")
-    ] = 24_000_000
+    max_image_pixels: Annotated[int, Field(ge=1_000, le=500_000_000, description="Largest image, width x height")] = (
+        24_000_000
+    )
     max_json_bytes: Annotated[
         int, Field(ge=1_000, le=10_000_000, description="Largest request body without an image")
     ] = 64_000
@@ -76,9 +66,7 @@ class Settings(BaseSettings):
         float, Field(gt=0, le=600, description="Longest time for a request's headers, and for its body")
     ] = 30.0
 
-    log_level: Annotated[
-        Literal["debug", "info", "warning", "error"], Field(description="Least level logged")
-    ] = "info"
+    log_level: Annotated[Literal["debug", "info", "warning", "error"], Field(description="Least level logged")] = "info"
     log_format: Annotated[
         Literal["console", "json"], Field(description="One event a line, for people or for machines")
     ] = "console"

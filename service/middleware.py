@@ -120,9 +120,7 @@ class LimitRequests:
     ``max_bytes_by_path`` overrides ``max_bytes`` for single paths. Raises ``TooLarge``, ``ReceiveTimeout``.
     """
 
-    def __init__(
-        self, app: ASGIApp, max_bytes: int, max_bytes_by_path: Mapping[str, int], deadline_s: float
-    ) -> None:
+    def __init__(self, app: ASGIApp, max_bytes: int, max_bytes_by_path: Mapping[str, int], deadline_s: float) -> None:
         self._app = app
         self._max_bytes = max_bytes
         self._max_bytes_by_path = max_bytes_by_path

@@ -104,9 +104,7 @@ def bind(host: str, port: int) -> socket.socket:
         listener.listen(BACKLOG)
     except OSError as exc:
         listener.close()
-        raise PortTakenError(
-            f"Cannot listen on {host}:{port} ({exc.strerror}): choose another --port."
-        ) from exc
+        raise PortTakenError(f"Cannot listen on {host}:{port} ({exc.strerror}): choose another --port.") from exc
     return listener
 
 

@@ -24,15 +24,13 @@ from service.errors import (
     NotFound,
     NotReady,
     PreconditionFailed,
-    ReceiveTimeout,
-    TooLarge,
     UnsupportedKind,
 )
 from service.optics import thin_lens
 from service.optics.camera import RANGE_BLUR_ERROR_PX, Camera
 from service.storage.cameras import CameraRecord
 
-BODY_ERRORS = (BadRequest, ReceiveTimeout, TooLarge, UnsupportedKind)
+BODY_ERRORS = (BadRequest, UnsupportedKind)
 STORE_ERRORS = (Busy, NotReady)
 ETAG = {"ETag": {"description": "The revision, for If-Match", "schema": {"type": "string"}}}
 LOCATION = {"Location": {"description": "The camera's path", "schema": {"type": "string"}}}
@@ -43,7 +41,7 @@ router = APIRouter(prefix="/cameras", tags=["cameras"])
 IfMatch = Annotated[
     str | None, Header(description="ETag of the revision that is to be changed; another one answers 412")
 ]
-Depth = Annotated[float | None, Query(gt=0, le=100_000, allow_inf_nan=False, description="Metres")]
+Depth = Annotated[float | None, Query(ge=0.001, le=100_000, allow_inf_nan=False, description="Metres")]
 
 
 @router.post(
@@ -70,9 +68,7 @@ def create_camera(body: CameraCreate, cameras: CamerasDep, response: Response) -
 def list_cameras(
     cameras: CamerasDep,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
-    cursor: Annotated[
-        str | None, Query(max_length=200, description="`next_cursor` of the page before")
-    ] = None,
+    cursor: Annotated[str | None, Query(max_length=200, description="`next_cursor` of the page before")] = None,
 ) -> CameraPage:
     """Cameras at their current revisions, a page at a time."""
     records, has_more = cameras.page(limit, name_of(cursor))

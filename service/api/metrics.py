@@ -11,6 +11,8 @@ from prometheus_client import (
 )
 from prometheus_client.process_collector import ProcessCollector
 
+from service.api.problems import responses
+
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 UNMATCHED = "unmatched"
 DURATION_BUCKETS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
@@ -32,9 +34,7 @@ class Metrics:
             buckets=DURATION_BUCKETS_S,
             registry=self.registry,
         )
-        self.in_progress = Gauge(
-            "camind_requests_in_progress", "Requests being answered", registry=self.registry
-        )
+        self.in_progress = Gauge("camind_requests_in_progress", "Requests being answered", registry=self.registry)
 
     def count(self, method: str, path_template: str | None, status: int, duration_s: float) -> None:
         """One answered request; a path that no route has counts as ``unmatched``."""
@@ -56,7 +56,8 @@ router = APIRouter(tags=["service"])
         200: {
             "description": "Prometheus text format",
             "content": {"text/plain": {"schema": {"type": "string"}}},
-        }
+        },
+        **responses(),
     },
 )
 def read_metrics(request: Request) -> Response:

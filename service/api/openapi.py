@@ -8,11 +8,14 @@ from typing import Any
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
-from service.api.problems import Problem
+from service.api.problems import Problem, responses
+from service.errors import ReceiveTimeout, TooLarge
 
 # words that YAML reads as truth values or nothing
 YAML_WORDS = frozenset({"null", "true", "false", "yes", "no", "on", "off", "y", "n"})
 REF = "#/components/schemas/{model}"
+# what the limits in front of the routes answer
+BODY_ERRORS = (ReceiveTimeout, TooLarge)
 FRAMEWORK_SCHEMAS = ("HTTPValidationError", "ValidationError")
 REQUEST_ID_REF = {"$ref": "#/components/headers/RequestId"}
 REQUEST_ID = {
@@ -56,6 +59,9 @@ def _complete(operation: dict[str, Any]) -> None:
     # the framework assumes its own 422 wherever a route takes a parameter and documents none
     if "HTTPValidationError" in str(operation["responses"].get("422", "")):
         del operation["responses"]["422"]
+    if "requestBody" in operation:
+        for status, answer in responses(*BODY_ERRORS).items():
+            operation["responses"].setdefault(str(status), answer)
     for answer in operation["responses"].values():
         answer.setdefault("headers", {})["X-Request-Id"] = REQUEST_ID_REF
 
@@ -74,7 +80,7 @@ def _lines(value: object, depth: int) -> Iterator[str]:
         for item in value:
             yield from _entry(f"{indent}-", item, depth + 1)
     else:
-        yield indent + json.dumps(value, ensure_ascii=False)
+        yield indent + _scalar(value)
 
 
 def _entry(head: str, item: object, depth: int) -> Iterator[str]:
@@ -82,7 +88,13 @@ def _entry(head: str, item: object, depth: int) -> Iterator[str]:
         yield head
         yield from _lines(item, depth)
     else:
-        yield f"{head} {json.dumps(item, ensure_ascii=False)}"
+        yield f"{head} {_scalar(item)}"
+
+
+def _scalar(value: object) -> str:
+    text = json.dumps(value, ensure_ascii=False)
+    # without a point, 1e-06 is a word to readers of YAML 1.1
+    return text.replace("e", ".0e") if isinstance(value, float) and "." not in text else text
 
 
 def _key(text: str) -> str:

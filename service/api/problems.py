@@ -19,9 +19,7 @@ class ProblemField(BaseModel):
 
     pointer: Annotated[
         str,
-        Field(
-            description="JSON pointer into the body (`#/lens/f_number`), or a parameter's or header's name"
-        ),
+        Field(description="JSON pointer into the body (`#/lens/f_number`), or a parameter's or header's name"),
     ]
     detail: str
 
@@ -60,8 +58,8 @@ def problem_response(error: CamindError, headers: Mapping[str, str] | None = Non
 
 EXAMPLES: dict[str, tuple[str, tuple[FieldProblem, ...]]] = {
     "invalid-request": (
-        "lens.focal_length_mm: Input should be greater than 0",
-        (FieldProblem("#/lens/focal_length_mm", "Input should be greater than 0"),),
+        "lens.focal_length_mm: Input should be greater than or equal to 0.01",
+        (FieldProblem("#/lens/focal_length_mm", "Input should be greater than or equal to 0.01"),),
     ),
     "invalid-image": ("The JPEG ends before its last row: send the whole file.", ()),
     "image-size-mismatch": (

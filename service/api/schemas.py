@@ -12,12 +12,10 @@ from service.storage.cameras import DEFAULT_K_R, NAME_PATTERN, CameraDraft, Came
 DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 PLAIN_TEXT = r"^[^\x00-\x08\x0b\x0c\x0e-\x1f\x7f]*$"
 
-Name = Annotated[
-    str, Field(pattern=NAME_PATTERN, description="Unique; stands in the camera's URL", examples=["d200"])
-]
+Name = Annotated[str, Field(pattern=NAME_PATTERN, description="Unique; stands in the camera's URL", examples=["d200"])]
 Pixels = Annotated[int, Field(gt=0, le=100_000)]
-Metres = Annotated[float, Field(gt=0, le=100_000, allow_inf_nan=False)]
-BlurPixels = Annotated[float, Field(gt=0, le=1_000_000, allow_inf_nan=False)]
+Metres = Annotated[float, Field(ge=0.001, le=100_000, allow_inf_nan=False)]
+BlurPixels = Annotated[float, Field(ge=1e-6, le=1_000_000, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
 
 
@@ -32,19 +30,17 @@ class LensSpecs(Given):
 
     focal_length_mm: Annotated[
         float,
-        Field(
-            gt=0, le=10_000, allow_inf_nan=False, description="Real focal length, never the 35-mm equivalent"
-        ),
+        Field(ge=0.01, le=10_000, allow_inf_nan=False, description="Real focal length, never the 35-mm equivalent"),
     ]
-    f_number: Annotated[float, Field(gt=0, le=1_000, allow_inf_nan=False, description="Aperture number N")]
+    f_number: Annotated[float, Field(ge=0.1, le=1_000, allow_inf_nan=False, description="Aperture number N")]
     pixel_pitch_um: Annotated[
-        float, Field(gt=0, le=1_000, allow_inf_nan=False, description="Pitch of one sensor pixel")
+        float, Field(ge=0.01, le=1_000, allow_inf_nan=False, description="Pitch of one sensor pixel")
     ]
     sensor_width_px: Annotated[Pixels, Field(description="Width of the whole sensor in its own pixels")]
     k_r: Annotated[
         float,
         Field(
-            gt=0,
+            ge=0.01,
             le=100,
             allow_inf_nan=False,
             description="Diameter of the circle of confusion over its standard deviation; a disc has 4",
@@ -70,9 +66,7 @@ class PinholeIntrinsics(Given):
     def to_domain(self) -> Intrinsics:
         """The intrinsics as the physics takes them; ``BadRequest`` for a count OpenCV does not know."""
         if len(self.distortion) not in DISTORTION_LENGTHS:
-            raise _fault(
-                "#/intrinsics/distortion", "Send 0, 4, 5, 8, 12 or 14 coefficients, in OpenCV's order."
-            )
+            raise _fault("#/intrinsics/distortion", "Send 0, 4, 5, 8, 12 or 14 coefficients, in OpenCV's order.")
         return Intrinsics(self.fx_px, self.fy_px, self.cx_px, self.cy_px, tuple(self.distortion))
 
 
@@ -121,9 +115,7 @@ class CameraSpecs(Given):
         if lens is None or self.k_cam_px is not None:
             both = "not both" if lens else "one of them is needed"
             detail = f"Send exactly one of k_cam_px and lens, {both}."
-            raise BadRequest(
-                detail, errors=(FieldProblem("#/k_cam_px", detail), FieldProblem("#/lens", detail))
-            )
+            raise BadRequest(detail, errors=(FieldProblem("#/k_cam_px", detail), FieldProblem("#/lens", detail)))
         if lens.focal_length_m >= self.focus_distance_m:
             raise _fault(
                 "#/lens/focal_length_mm",
@@ -205,9 +197,7 @@ class CameraRead(BaseModel):
     intrinsics: PinholeIntrinsics | None
     fx_px: Annotated[float | None, Field(description="From the intrinsics or the lens, else null")]
     range_m: RangeRead
-    revision: Annotated[
-        int, Field(description="Grows by one with every change; never used twice under one name")
-    ]
+    revision: Annotated[int, Field(description="Grows by one with every change; never used twice under one name")]
     created_at: Annotated[datetime, Field(description="UTC")]
     updated_at: Annotated[datetime, Field(description="UTC")]
 
@@ -240,9 +230,7 @@ class CameraPage(BaseModel):
     """Cameras by name."""
 
     items: list[CameraRead]
-    next_cursor: Annotated[
-        str | None, Field(description="Pass it as `cursor` for the next page; null: the last")
-    ]
+    next_cursor: Annotated[str | None, Field(description="Pass it as `cursor` for the next page; null: the last")]
 
 
 class CurvePoint(BaseModel):

@@ -144,9 +144,7 @@ def _require_row(session: Session, name: str, expected: Sequence[int] | None) ->
     """The row, locked until the end of the transaction, at one of the expected revisions."""
     row = _live(_find_row(session, name, lock=True), name)
     if expected is not None and row.revision not in expected:
-        raise PreconditionFailed(
-            f"Camera '{name}' is at revision {row.revision}: read it again, then repeat."
-        )
+        raise PreconditionFailed(f"Camera '{name}' is at revision {row.revision}: read it again, then repeat.")
     return row
 
 
@@ -213,12 +211,7 @@ def _to_record(row: CameraRow, revision: CameraRevisionRow) -> CameraRecord:
 
 
 def _to_lens(row: CameraRevisionRow) -> Lens | None:
-    if (
-        row.focal_length_mm is None
-        or row.f_number is None
-        or row.pixel_pitch_um is None
-        or row.sensor_width_px is None
-    ):
+    if row.focal_length_mm is None or row.f_number is None or row.pixel_pitch_um is None or row.sensor_width_px is None:
         return None
     return Lens(row.focal_length_mm, row.f_number, row.pixel_pitch_um, row.sensor_width_px, row.k_r)
 

@@ -7,12 +7,14 @@ from pathlib import Path
 
 from sqlalchemy import Connection, Engine, create_engine, event, make_url
 from sqlalchemy.exc import InternalError, OperationalError, ProgrammingError
+from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from sqlalchemy.pool import ConnectionPoolEntry
 from sqlmodel import Session
 
 from service.errors import Busy, NotReady
 
 BUSY_TIMEOUT_MS = 5_000
+POOL_TIMEOUT_S = 5.0
 # older ones can corrupt a database when two connections write and checkpoint at the same instant
 FIRST_SAFE_WAL = (3, 51, 3)
 IS_WRITE = "camind_is_write"
@@ -22,10 +24,10 @@ def open_engine(database_url: str) -> Engine:
     """An engine for the URL; the folder of an SQLite file is made. Nothing is connected yet."""
     url = make_url(database_url)
     if url.get_backend_name() != "sqlite":
-        return create_engine(url, pool_pre_ping=True)
+        return create_engine(url, pool_timeout=POOL_TIMEOUT_S, pool_pre_ping=True)
     if url.database and url.database != ":memory:":
         Path(url.database).parent.mkdir(parents=True, exist_ok=True)
-    engine = create_engine(url)
+    engine = create_engine(url, pool_timeout=POOL_TIMEOUT_S)
     event.listen(engine, "connect", _prepare_sqlite)
     event.listen(engine, "begin", _begin_sqlite)
     return engine
@@ -80,6 +82,8 @@ def _begin_sqlite(connection: Connection) -> None:
 def _translated() -> Iterator[None]:
     try:
         yield
+    except PoolTimeoutError as exc:
+        raise Busy("Every connection to the database is taken: try again in a second.") from exc
     except (OperationalError, InternalError, ProgrammingError) as exc:
         if "locked" in str(exc.orig):
             raise Busy("The database is busy: try again in a second.") from exc

@@ -72,6 +72,4 @@ class CameraRevisionRow(SQLModel, table=True):
     fy_px: float | None = None
     cx_px: float | None = None
     cy_px: float | None = None
-    distortion: list[float] | None = Field(
-        default=None, sa_column=Column(JSON(none_as_null=True), nullable=True)
-    )
+    distortion: list[float] | None = Field(default=None, sa_column=Column(JSON(none_as_null=True), nullable=True))

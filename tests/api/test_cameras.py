@@ -111,8 +111,8 @@ def test_if_match_holds_back_what_knows_another_revision(
     client: TestClient, d200: dict[str, Any], tag: str, method: str
 ) -> None:
     client.post("/cameras", json=d200)
-    body = {"json": d200} if method == "PUT" else {}
-    answer = client.request(method, "/cameras/d200", headers={"If-Match": tag}, **body)
+    body = d200 if method == "PUT" else None
+    answer = client.request(method, "/cameras/d200", headers={"If-Match": tag}, json=body)
     assert answer.status_code == 412
     assert client.get("/cameras/d200").json()["revision"] == 1
 
@@ -304,8 +304,8 @@ def test_a_missing_field_is_pointed_at(client: TestClient, phone: dict[str, Any]
 def test_an_unknown_camera_is_not_found(client: TestClient, phone: dict[str, Any], name: str) -> None:
     del phone["name"]
     for method, path in (("GET", ""), ("DELETE", ""), ("GET", "/curve"), ("PUT", "")):
-        body = {"json": phone} if method == "PUT" else {}
-        answer = client.request(method, f"/cameras/{name}{path}", **body)
+        body = phone if method == "PUT" else None
+        answer = client.request(method, f"/cameras/{name}{path}", json=body)
         assert answer.status_code == 404, (method, path)
         assert answer.headers["content-type"] == PROBLEM
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from fastapi import FastAPI
 from starlette.testclient import TestClient
 
+from service.app import create_app
 from service.config import Settings
 from service.storage import schema
 
@@ -66,3 +67,16 @@ def test_a_stopped_service_starts_again_with_its_cameras(app: FastAPI, settings:
     with TestClient(app) as client:
         assert client.get("/cameras/kept").json()["k_cam_px"] == 2
     assert (settings.data_dir / "camind.sqlite3").is_file()
+
+
+def test_a_shared_database_is_migrated_by_hand(settings: Settings, postgres_url: str) -> None:
+    app = create_app(settings.model_copy(update={"database_url": postgres_url}))
+    body = {"image_width_px": 4, "image_height_px": 3, "focus_distance_m": 1, "k_cam_px": 2}
+    with TestClient(app) as client:
+        assert client.get("/health/ready").status_code == 503
+        assert client.post("/cameras", json={"name": "kept", **body}).status_code == 503
+        schema.upgrade(app.state.engine)
+        assert client.get("/health/ready").status_code == 200
+        assert client.post("/cameras", json={"name": "kept", **body}).status_code == 201
+        assert client.get("/cameras/kept").json()["k_cam_px"] == 2
+        assert client.get("/cameras/a%00b").status_code == 404

@@ -1,12 +1,13 @@
 """Commits are durable, references hold, and what the database cannot do is told apart."""
 
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 from sqlalchemy import Engine
 from sqlalchemy.exc import IntegrityError
 
-from service.errors import NotReady
+from service.errors import Busy, NotReady
 from service.storage import schema
 from service.storage.engine import journal_mode, open_engine, reading, require_writable, writing
 from service.storage.tables import CameraRevisionRow
@@ -39,8 +40,6 @@ def test_the_write_ahead_log_waits_for_a_sound_sqlite() -> None:
 
 
 def test_a_revision_needs_its_camera(engine: Engine) -> None:
-    from datetime import UTC, datetime
-
     orphan = CameraRevisionRow(
         camera_id=99,
         revision=1,
@@ -69,6 +68,17 @@ def test_an_unreachable_server_is_not_ready(tmp_path: Path) -> None:
     engine = open_engine(f"postgresql+psycopg://nobody@/none?host={tmp_path}")
     with pytest.raises(NotReady), reading(engine) as session:
         session.connection()
+
+
+def test_no_free_connection_is_busy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.storage.engine.POOL_TIMEOUT_S", 0.05)
+    engine = open_engine(f"sqlite:///{tmp_path / 'a.sqlite3'}")
+    taken = [engine.connect() for _ in range(15)]
+    with pytest.raises(Busy), reading(engine) as session:
+        session.connection()
+    for connection in taken:
+        connection.close()
+    engine.dispose()
 
 
 def test_a_migrated_database_is_ready(engine: Engine) -> None:

@@ -1,0 +1,78 @@
+"""House rules that no linter knows."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SERVICE = sorted((ROOT / "service").rglob("*.py"))
+OPTICS = sorted((ROOT / "service" / "optics").rglob("*.py"))
+
+BLOCKED = """
+import sys
+for name in ("torch", "onnx", "onnxscript", "model_export"):
+    sys.modules[name] = None
+import service.app, service.cli
+assert "cv2" not in sys.modules or __import__("os").environ["OPENCV_IO_MAX_IMAGE_PIXELS"]
+"""
+NO_SETTINGS_AT_IMPORT = """
+import os
+os.environ["CAMIND_PORT"] = "nonsense"
+import service.app, service.cli, service.config
+"""
+
+
+def imports_of(path: Path) -> Iterator[str]:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module
+
+
+def importers(name: str, files: list[Path]) -> list[str]:
+    return [
+        str(path.relative_to(ROOT)) for path in files if any(each.split(".")[0] == name for each in imports_of(path))
+    ]
+
+
+def run_python(code: str) -> None:
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("name", ["torch", "onnx", "onnxscript", "model_export", "matplotlib"])
+def test_the_service_imports_nothing_of_training(name: str) -> None:
+    assert importers(name, SERVICE) == []
+
+
+def test_the_service_starts_where_torch_is_absent() -> None:
+    run_python(BLOCKED)
+
+
+def test_nothing_reads_the_settings_at_import() -> None:
+    run_python(NO_SETTINGS_AT_IMPORT)
+
+
+@pytest.mark.parametrize("name", ["onnxruntime", "cv2"])
+def test_one_module_alone_imports(name: str) -> None:
+    assert len(importers(name, SERVICE)) == 1
+
+
+@pytest.mark.parametrize("name", ["numpy", "cv2", "fastapi", "pydantic", "sqlmodel"])
+def test_the_physics_imports_the_standard_library_alone(name: str) -> None:
+    assert importers(name, OPTICS) == []
+
+
+def test_no_folder_is_called_after_nothing() -> None:
+    names = {part for path in SERVICE for part in path.relative_to(ROOT).with_suffix("").parts}
+    assert not names & {"utils", "util", "common", "core", "helpers", "misc"}
+
+
+def test_the_environment_is_read_in_one_place() -> None:
+    readers = [path.name for path in SERVICE if "os.environ" in path.read_text(encoding="utf-8")]
+    assert set(readers) <= {"config.py", "opencv.py"}

@@ -1,0 +1,93 @@
+"""The command line, run as people run it."""
+
+import os
+import socket
+import subprocess
+import sys
+from importlib.metadata import EntryPoint, version
+from pathlib import Path
+
+import pytest
+import typer
+
+from service import cli
+
+CAMIND = Path(sys.executable).parent / "camind"
+
+
+def camind(data_dir: Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "CAMIND_DATA_DIR": str(data_dir), **variables}
+    return subprocess.run([CAMIND, *arguments], env=environment, capture_output=True, text=True, check=False)
+
+
+def test_seeds_are_stored_once_and_listed(tmp_path: Path) -> None:
+    seeded = camind(tmp_path, "cameras", "seed")
+    assert seeded.returncode == 0, seeded.stderr
+    assert len(seeded.stdout.split()) == 17
+    assert "already" in camind(tmp_path, "cameras", "seed").stdout
+    listed = camind(tmp_path, "cameras", "list").stdout.splitlines()
+    assert len(listed) == 17
+    assert "canon-t7-50mm-f1.2\tr1\t71.8 px\t2 m\t6000x4000" in listed
+
+
+def test_migrate_says_where_the_database_is(tmp_path: Path) -> None:
+    done = camind(tmp_path, "migrate")
+    assert (done.returncode, done.stdout) == (0, "The database is at 2026_11_21_cameras.\n")
+
+
+def test_the_version_is_the_package_s(tmp_path: Path) -> None:
+    assert camind(tmp_path, "version").stdout.strip() == version("camind")
+
+
+def test_a_wrong_setting_refuses_to_start(tmp_path: Path) -> None:
+    done = camind(tmp_path, "serve", CAMIND_DEADLINE_S="-1")
+    assert done.returncode == 2
+    assert done.stderr.startswith("CAMIND_DEADLINE_S=-1: ")
+    assert "Traceback" not in done.stderr
+
+
+def test_a_taken_port_is_said(tmp_path: Path, tiny_model_dir: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        done = camind(tmp_path, "serve", "--port", port, "--model", str(tiny_model_dir))
+    assert done.returncode == 1
+    assert f"127.0.0.1:{port}" in done.stderr
+    assert "--port" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_broken_model_is_said(tmp_path: Path) -> None:
+    done = camind(tmp_path, "serve", "--port", "0", "--model", str(tmp_path))
+    assert done.returncode == 1
+    assert "manifest.json" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("command", [("migrate",), ("cameras", "seed"), ("serve", "--port", "0")])
+def test_an_unusable_database_is_said(tmp_path: Path, tiny_model_dir: Path, command: tuple[str, ...]) -> None:
+    (tmp_path / "file").touch()
+    url = f"sqlite:///{tmp_path}/file/a.sqlite3"
+    done = camind(tmp_path, *command, CAMIND_DATABASE_URL=url, CAMIND_MODEL_DIR=str(tiny_model_dir))
+    assert done.returncode == 1
+    assert done.stderr.strip()
+    assert "Traceback" not in done.stderr
+
+
+def test_other_packages_commands_stand_beside_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    entry_point = EntryPoint("extra", "tests.test_cli:EXTRA", cli.GROUP)
+    monkeypatch.setattr(cli.app, "registered_commands", list(cli.app.registered_commands))
+    cli._add_commands(entry_point)
+    assert "extra" in typer.main.get_command(cli.app).commands  # type: ignore[attr-defined]
+
+
+def test_commands_that_cannot_be_loaded_are_a_hint(capsys: pytest.CaptureFixture[str]) -> None:
+    cli._add_commands(EntryPoint("absent", "no_such_package.cli:commands", cli.GROUP))
+    assert "no_such_package" in capsys.readouterr().err
+
+
+EXTRA = typer.Typer()
+
+
+@EXTRA.command(name="extra")
+def run_extra() -> None:
+    """Do nothing."""

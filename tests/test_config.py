@@ -1,0 +1,94 @@
+"""Settings come from CAMIND_ variables, have bounds, and refuse to start with what lies beyond."""
+
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from service.config import SHIPPED_MODEL, Settings, SettingsError, available_cores, load_settings
+
+
+@pytest.fixture(autouse=True)
+def _only_these(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    import os
+
+    for name in [name for name in os.environ if name.startswith("CAMIND_")]:
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+
+
+def test_the_defaults_serve_this_machine_only(tmp_path: Path) -> None:
+    settings = load_settings()
+    assert settings.is_loopback
+    assert settings.port == 8000
+    assert settings.model_dir == SHIPPED_MODEL
+    assert settings.effective_database_url == f"sqlite:///{tmp_path / 'camind' / 'camind.sqlite3'}"
+    assert settings.worker_slots * settings.threads_per_worker <= available_cores()
+
+
+def test_variables_and_then_the_command_line_win(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("CAMIND_PORT", "9000")
+    monkeypatch.setenv("CAMIND_HOST", "0.0.0.0")  # noqa: S104  (a name, not a bind)
+    monkeypatch.setenv("CAMIND_DATA_DIR", str(tmp_path / "own"))
+    settings = load_settings(port=9001, host=None)
+    assert settings.port == 9001
+    assert not settings.is_loopback
+    assert settings.effective_database_url.endswith("own/camind.sqlite3")
+
+
+def test_an_empty_variable_counts_as_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CAMIND_PORT", "")
+    assert load_settings().port == 8000
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("PORT", "70000"),
+        ("PORT", "http"),
+        ("DEADLINE_S", "0"),
+        ("DEADLINE_S", "nan"),
+        ("QUEUE_SIZE", "-1"),
+        ("MAX_IMAGE_PIXELS", "0"),
+        ("MAX_IMAGE_BYTES", "1e12"),
+        ("RECEIVE_DEADLINE_S", "inf"),
+        ("LOG_LEVEL", "loud"),
+        ("LOG_FORMAT", "xml"),
+        ("DATABASE_URL", "mysql://localhost/camind"),
+        ("DATABASE_URL", "postgresql://localhost/camind"),
+        ("DATABASE_URL", "nonsense"),
+        ("WORKERS", "-1"),
+    ],
+)
+def test_a_wrong_value_is_named(monkeypatch: pytest.MonkeyPatch, name: str, value: str) -> None:
+    monkeypatch.setenv(f"CAMIND_{name}", value)
+    with pytest.raises(SettingsError, match=f"CAMIND_{name}"):
+        load_settings()
+
+
+def test_more_threads_than_cores_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.config.available_cores", lambda: 4)
+    settings = load_settings(workers=2)
+    assert (settings.worker_slots, settings.threads_per_worker) == (2, 2)
+    assert load_settings(intra_op_threads=1).worker_slots == 2
+    with pytest.raises(SettingsError, match="3 x 2, more than the 4 cores"):
+        load_settings(workers=3, intra_op_threads=2)
+    with pytest.raises(SettingsError, match="8 x 1"):
+        load_settings(workers=8)
+
+
+@pytest.mark.parametrize("cores", [1, 2, 3, 8, 64])
+def test_the_defaults_fit_every_machine(monkeypatch: pytest.MonkeyPatch, cores: int) -> None:
+    monkeypatch.setattr("service.config.available_cores", lambda: cores)
+    settings = load_settings()
+    assert 1 <= settings.worker_slots * settings.threads_per_worker <= cores
+
+
+def test_settings_do_not_change() -> None:
+    settings = load_settings()
+    with pytest.raises(ValidationError):
+        setattr(settings, "port", 1)  # noqa: B010  (the checker knows it is frozen)
+
+
+def test_every_setting_says_what_it_means() -> None:
+    assert all(field.description for field in Settings.model_fields.values())

@@ -1,0 +1,96 @@
+"""openapi.yaml is the app's, whole, and says of every route what it answers."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from fastapi import FastAPI
+
+from service.api.openapi import to_yaml
+
+COMMITTED = Path(__file__).parents[1] / "openapi.yaml"
+METHODS = {"get", "put", "post", "delete", "patch"}
+
+
+@pytest.fixture
+def document(app: FastAPI) -> dict[str, Any]:
+    return app.openapi()
+
+
+def operations(document: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    return [
+        (f"{method} {path}", operation)
+        for path, item in document["paths"].items()
+        for method, operation in item.items()
+        if method in METHODS
+    ]
+
+
+def test_the_committed_file_is_the_app_s(document: dict[str, Any]) -> None:
+    assert COMMITTED.read_text(encoding="utf-8") == to_yaml(document), "run `make openapi` and commit the file"
+
+
+def test_the_file_is_yaml_of_the_same_content(document: dict[str, Any]) -> None:
+    assert yaml.safe_load(to_yaml(document)) == document
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        {},
+        [],
+        {"a": []},
+        [[1, [2]], {"b": {}}],
+        "yes",
+        {"on": "off", "1": None, "a: b": "x #y", "": 1.5, "x": [1e-6, 1e30, -2.5e-9, 3.0], "~": True},
+    ],
+)
+def test_yaml_reads_back_what_was_written(value: object) -> None:
+    assert yaml.safe_load(to_yaml(value)) == value
+
+
+def test_errors_are_documented_as_problems_with_examples(document: dict[str, Any]) -> None:
+    for name, operation in operations(document):
+        errors = {code: answer for code, answer in operation["responses"].items() if int(code) >= 400}
+        assert "500" in errors, name
+        for code, answer in errors.items():
+            content = answer["content"]["application/problem+json"]
+            assert content["schema"] == {"$ref": "#/components/schemas/Problem"}
+            assert content["examples"], (name, code)
+            for example in content["examples"].values():
+                assert example["value"]["status"] == int(code)
+
+
+def test_what_takes_a_camera_documents_its_absence(document: dict[str, Any]) -> None:
+    for name, operation in operations(document):
+        if "{name}" in name or name == "post /depth":
+            assert "404" in operation["responses"], name
+
+
+def test_what_takes_a_body_documents_its_limits(document: dict[str, Any]) -> None:
+    for name, operation in operations(document):
+        if "requestBody" in operation:
+            assert {"408", "413", "415", "422"} <= set(operation["responses"]), name
+
+
+def test_operation_ids_are_plain_and_unique(document: dict[str, Any]) -> None:
+    ids = [operation["operationId"] for _, operation in operations(document)]
+    assert len(set(ids)) == len(ids)
+    assert all(operation_id.isalpha() for operation_id in ids)
+
+
+def test_the_framework_s_own_errors_are_nowhere(document: dict[str, Any]) -> None:
+    assert "HTTPValidationError" not in str(document)
+
+
+def test_every_reference_leads_somewhere(document: dict[str, Any]) -> None:
+    def references(value: object) -> list[str]:
+        if isinstance(value, dict):
+            own = [value["$ref"]] if isinstance(value.get("$ref"), str) else []
+            return own + [found for item in value.values() for found in references(item)]
+        return [found for item in value for found in references(item)] if isinstance(value, list) else []
+
+    for reference in references(document):
+        _, section, kind, name = reference.split("/")
+        assert name in document[section][kind], reference

@@ -1,0 +1,202 @@
+"""The real process: what it acknowledged survives SIGKILL, and no client can hold or confuse it."""
+
+import http.client
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import pytest
+
+CAMIND = Path(sys.executable).parent / "camind"
+START_S = 60
+RECEIVE_DEADLINE_S = 1.0
+T = TypeVar("T")
+CAMERA = {"image_width_px": 4, "image_height_px": 3, "focus_distance_m": 1.0, "k_cam_px": 2.0}
+
+
+class Server:
+    """A started ``camind serve`` on a port the system chose."""
+
+    def __init__(self, data_dir: Path, model_dir: Path) -> None:
+        environment = {
+            **os.environ,
+            "CAMIND_DATA_DIR": str(data_dir),
+            "CAMIND_RECEIVE_DEADLINE_S": str(RECEIVE_DEADLINE_S),
+            "CAMIND_MAX_IMAGE_BYTES": "200000",
+            "CAMIND_LOG_FORMAT": "json",
+        }
+        self._log = data_dir.parent / "server.log"
+        command: list[str | Path] = [CAMIND, "serve", "--port", "0", "--model", model_dir]
+        with self._log.open("w") as log:
+            self.process = subprocess.Popen(command, env=environment, stderr=log)
+        self.port = self._wait_for_port()
+        self._wait_until_ready()
+
+    @property
+    def log(self) -> str:
+        return self._log.read_text()
+
+    def connect(self) -> socket.socket:
+        return socket.create_connection(("127.0.0.1", self.port), timeout=10)
+
+    def request(
+        self, method: str, path: str, body: bytes | str | None = None, headers: dict[str, str] | None = None
+    ) -> tuple[int, dict[str, Any]]:
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=10)
+        try:
+            connection.request(method, path, body, headers or {})
+            answer = connection.getresponse()
+            return answer.status, json.loads(answer.read())
+        finally:
+            connection.close()
+
+    def add(self, name: str) -> int:
+        body = json.dumps({"name": name, **CAMERA})
+        return self.request("POST", "/cameras", body, {"Content-Type": "application/json"})[0]
+
+    def stop(self, number: int) -> int:
+        self.process.send_signal(number)
+        return self.process.wait(timeout=30)
+
+    def _wait_for_port(self) -> int:
+        def find() -> int | None:
+            found = re.search(r"camind on http://127\.0\.0\.1:(\d+)", self.log)
+            return int(found[1]) if found else None
+
+        return self.poll(find)
+
+    def _wait_until_ready(self) -> None:
+        self.poll(lambda: self.request("GET", "/health/ready")[0] == 200)
+
+    def poll(self, look: Callable[[], T | None]) -> T:
+        give_up = time.monotonic() + START_S
+        while time.monotonic() < give_up:
+            assert self.process.poll() is None, self.log
+            found = look()
+            if found:
+                return found
+            time.sleep(0.05)
+        raise AssertionError(f"not up within {START_S} s:\n{self.log}")
+
+
+@contextmanager
+def serving(data_dir: Path, model_dir: Path) -> Iterator[Server]:
+    server = Server(data_dir, model_dir)
+    try:
+        yield server
+    finally:
+        if server.process.poll() is None:
+            server.process.kill()
+            server.process.wait()
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory, tiny_model_dir: Path) -> Iterator[Server]:
+    with serving(tmp_path_factory.mktemp("server") / "data", tiny_model_dir) as running:
+        yield running
+
+
+def read_to_end(connection: socket.socket) -> tuple[int, dict[str, str], bytes]:
+    """The last answer before the server closes the connection."""
+    raw = b""
+    while chunk := connection.recv(65536):
+        raw += chunk
+    head, _, body = raw.rpartition(b"HTTP/1.1 ")[2].partition(b"\r\n\r\n")
+    status, *lines = head.decode().split("\r\n")
+    return int(status.split()[0]), dict(line.lower().split(": ", 1) for line in lines), body
+
+
+def test_what_was_acknowledged_survives_a_kill(tmp_path: Path, tiny_model_dir: Path) -> None:
+    data_dir = tmp_path / "data"
+    with serving(data_dir, tiny_model_dir) as first:
+        assert [first.add(f"camera-{number}") for number in range(5)] == [201] * 5
+        assert first.stop(signal.SIGKILL) == -signal.SIGKILL
+    with serving(data_dir, tiny_model_dir) as second:
+        status, page = second.request("GET", "/cameras")
+        assert status == 200
+        assert [camera["name"] for camera in page["items"]] == [f"camera-{number}" for number in range(5)]
+        assert second.add("camera-0") == 409
+        assert second.stop(signal.SIGTERM) in (0, -signal.SIGTERM)
+
+
+def test_headers_that_never_end_are_cut_off(server: Server) -> None:
+    with server.connect() as connection:
+        started = time.monotonic()
+        connection.sendall(b"GET /cameras HTTP/1.1\r\nHost: x\r\n")
+        status, headers, body = read_to_end(connection)
+    assert status == 408
+    assert headers["content-type"] == "application/problem+json"
+    assert json.loads(body)["type"] == "urn:camind:problem:receive-timeout"
+    assert time.monotonic() - started < RECEIVE_DEADLINE_S + 3
+
+
+def test_a_silent_connection_is_closed(server: Server) -> None:
+    with server.connect() as connection:
+        assert connection.recv(1) == b""
+
+
+@pytest.mark.parametrize("path", ["/cameras", "/depth?camera=x", "/nothing"])
+def test_a_body_that_never_ends_is_cut_off(server: Server, path: str) -> None:
+    head = f"POST {path} HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 9999\r\n\r\n"
+    with server.connect() as connection:
+        started = time.monotonic()
+        connection.sendall(head.encode() + b"{")
+        status, headers, _ = read_to_end(connection)
+    assert status in ((404, 408, 415) if path != "/cameras" else (408,))
+    assert headers["content-type"] == "application/problem+json"
+    assert headers["x-request-id"]
+    assert time.monotonic() - started < 2 * RECEIVE_DEADLINE_S + 4
+
+
+@pytest.mark.parametrize(
+    "raw", [b"NONSENSE\r\n\r\n", b"GET / HTTP/1.1\r\n\r\n", b"GET / HTTP/1.1\r\nHost: x\r\nA\x00: b\r\n\r\n"]
+)
+def test_what_is_no_http_gets_a_problem(server: Server, raw: bytes) -> None:
+    with server.connect() as connection:
+        connection.sendall(raw)
+        status, headers, body = read_to_end(connection)
+    assert status == 400
+    assert headers["content-type"] == "application/problem+json"
+    assert json.loads(body)["status"] == 400
+
+
+def test_a_body_that_is_too_large_is_answered_though_it_was_sent_whole(server: Server) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=10)
+    connection.request("POST", "/depth?camera=x", b"\xff" * 20_000_000, {"Content-Type": "image/jpeg"})
+    answer = connection.getresponse()
+    assert (answer.status, json.loads(answer.read())["status"]) == (413, 413)
+    # the rest was thrown away, and the connection goes on
+    connection.request("GET", "/health/live")
+    assert connection.getresponse().status == 200
+    connection.close()
+
+
+def test_a_body_that_grows_too_large_is_refused_while_it_comes(server: Server) -> None:
+    chunks = (b" " * 10_000 for _ in range(100))
+    headers = {"Content-Type": "application/json"}
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=10)
+    connection.request("POST", "/cameras", chunks, headers)
+    assert connection.getresponse().status == 413
+    connection.close()
+
+
+def test_the_log_has_one_json_event_a_request(server: Server) -> None:
+    server.request("GET", "/cameras/nobody", headers={"X-Request-Id": "find-me"})
+
+    def find() -> list[dict[str, Any]]:
+        return [json.loads(line) for line in server.log.splitlines() if "find-me" in line]
+
+    # the event is written when the answer has left
+    events = server.poll(find)
+    assert len(events) == 1
+    assert events[0]["path"] == "/cameras/{name}"
+    assert (events[0]["status"], events[0]["camera"], events[0]["level"]) == (404, "nobody", "info")
