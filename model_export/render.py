@@ -3,7 +3,7 @@
 Works in linear light. Every layer's colour is blurred premultiplied with its alpha, and layers are put
 over each other front to back, so a blurred edge of a near object shows what is behind it, a constant
 image stays constant, and no depth edge leaves a halo. Blurring is a product in the frequency domain with
-the exact transfer function of the point spread, so discs of any diameter cost the same.
+the transfer function of the point spread, so discs of any diameter cost the same.
 """
 
 import math
@@ -23,6 +23,7 @@ LEVEL_RATIO = 1.25
 LEVEL_OFFSET_PX = 0.5
 MARGIN_SIGMAS = 3.0
 PIXEL_BOX_VARIANCE = 1.0 / 12.0
+SOFT_EDGE_VARIANCE = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,15 +39,20 @@ def transfer(height: int, width: int, sigma_px: float, disc_share: float) -> Ten
     """Transfer function [h, w//2+1] of a point spread with standard deviation ``sigma_px`` per axis.
 
     ``disc_share`` of the variance is a uniform disc (whose standard deviation is a quarter of its
-    diameter), the rest a Gaussian; 0 is a Gaussian, 1 a sharp disc.
+    diameter), the rest a Gaussian; 0 is a Gaussian, 1 a disc with edges as soft as a pixel. The Gaussian is the
+    discrete one (Lindeberg 1990, exp(s^2 (cos w - 1)) per axis): positive and of exact variance at any sigma,
+    where a sampled or band-limited one of half a pixel rings.
     """
     fy = torch.fft.fftfreq(height)[:, None]
     fx = torch.fft.rfftfreq(width)[None, :]
-    frequency = torch.sqrt(fy * fy + fx * fx)
-    gauss = torch.exp(-2 * math.pi**2 * (1 - disc_share) * sigma_px**2 * frequency**2)
-    if disc_share == 0 or sigma_px == 0:
+    variance = sigma_px**2
+    gauss_variance = max((1 - disc_share) * variance, min(variance, SOFT_EDGE_VARIANCE))
+    falling = torch.cos(2 * math.pi * fy) + torch.cos(2 * math.pi * fx) - 2
+    gauss = torch.exp(gauss_variance * falling)
+    if gauss_variance >= variance:
         return gauss
-    t = (math.pi * 4 * math.sqrt(disc_share) * sigma_px * frequency).clamp_min(1e-4)
+    radius_px = 2 * math.sqrt(variance - gauss_variance)
+    t = (2 * math.pi * radius_px * torch.sqrt(fy * fy + fx * fx)).clamp_min(1e-4)
     disc: Tensor = 2 * torch.special.bessel_j1(t) / t
     return gauss * disc
 
@@ -94,12 +100,12 @@ def blur_varying(image: Tensor, sigma_px: Tensor, disc_share: float) -> Tensor:
 def composite(layers: Iterable[tuple[Tensor, Tensor]]) -> Tensor:
     """Put blurred (colour premultiplied [3,h,w], alpha [1,h,w]) over each other, nearest first.
 
-    The last layer must be opaque; what little it lacks is divided out, so a constant stays constant.
+    The last layer must be opaque; what little it lacks is divided out, so a constant stays constant. Alpha is
+    not clamped: a band-limited disc rings by a percent, colour and alpha alike, and cutting one alone would show.
     """
     image: Tensor | None = None
     clear: Tensor | None = None
     for color, alpha in layers:
-        alpha = alpha.clamp(0, 1)
         image = color if image is None or clear is None else image + clear * color
         clear = 1 - alpha if clear is None else clear * (1 - alpha)
     if image is None or clear is None:

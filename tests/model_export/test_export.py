@@ -1,0 +1,64 @@
+"""Export: the files answer as torch does, and the folder vouches for them."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from model_export.card import record_scores
+from model_export.config import Kind, TrainConfig
+from model_export.export import export_pair
+from model_export.networks import Pair, make_pair
+from model_export.verify import SIZES, TOLERANCE, verify_pair
+from service.inference.artifact import load_model_folder
+
+KINDS: list[Kind] = ["compact", "paper"]
+
+
+def untrained(kind: Kind) -> Pair:
+    torch.manual_seed(3)
+    pair = make_pair(kind)
+    for module in pair.modules().modules():
+        if isinstance(module, torch.nn.BatchNorm2d):  # as training leaves them: neither 0 nor 1
+            torch.nn.init.uniform_(module.running_mean, -0.1, 0.1)  # type: ignore[arg-type]
+            torch.nn.init.uniform_(module.running_var, 0.5, 1.5)  # type: ignore[arg-type]
+    return pair
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pair, Path]:
+    pair = untrained(request.param)
+    folder = tmp_path_factory.mktemp(request.param)
+    export_pair(pair, TrainConfig(kind=request.param), 0, folder, sources="- brick: CC0")
+    return pair, folder
+
+
+def test_onnx_runtime_answers_as_torch_on_three_sizes(exported: tuple[Pair, Path]) -> None:
+    differences = verify_pair(*exported)
+    assert {(d.height_px, d.width_px) for d in differences} == set(SIZES)
+    assert max(d.relative for d in differences) <= TOLERANCE
+
+
+def test_verify_notices_other_weights(exported: tuple[Pair, Path]) -> None:
+    pair, folder = exported
+    torch.manual_seed(4)
+    assert max(d.relative for d in verify_pair(make_pair(pair.kind), folder)) > TOLERANCE
+
+
+def test_the_folder_is_whole_and_small(exported: tuple[Pair, Path]) -> None:
+    pair, folder = exported
+    manifest = load_model_folder(folder).manifest
+    assert manifest.kind == pair.kind
+    assert manifest.stride == pair.stride
+    assert manifest.training.config["kind"] == pair.kind
+    assert sum(f.stat().st_size for f in folder.iterdir()) < 16_000_000
+
+
+def test_the_card_carries_ranges_licences_and_then_scores(exported: tuple[Pair, Path]) -> None:
+    folder = exported[1]
+    assert "- brick: CC0" in load_model_folder(folder).card()
+    record_scores(folder, {"plane.abs_rel": 0.05}, {"Depth": "| a |"}, "camind evaluate")
+    after = load_model_folder(folder)
+    assert after.manifest.scores == {"plane.abs_rel": 0.05}
+    assert "| a |" in after.card()
+    assert "Not evaluated" not in after.card()

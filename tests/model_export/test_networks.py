@@ -1,0 +1,82 @@
+"""Both pairs of networks, behind one interface."""
+
+import pytest
+import torch
+
+from model_export.config import Kind, TrainConfig
+from model_export.losses import Batch, correct, run_pair, total_loss
+from model_export.networks import BandEnergy, make_pair, parameter_count
+from model_export.render import blur
+
+KINDS: list[Kind] = ["compact", "paper"]
+
+
+def batch(size: int = 64, count: int = 2) -> Batch:
+    torch.manual_seed(0)
+    numbers = [torch.full((count,), value) for value in (3.81, 0.5, 2.0, 500.0, 0.0)]
+    return Batch(torch.rand(count, 3, size, size), torch.rand(count, 1, size, size) - 0.3, *numbers)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_both_pairs_answer_alike(kind: Kind) -> None:
+    pair = make_pair(kind)
+    seen, told = run_pair(pair, batch())
+    cells = (2, 1, 64 // pair.stride, 64 // pair.stride)
+    maps = (seen.blur_px, seen.log_error, told.log_ratio_near, told.log_ratio_far, told.near_logit, told.log_scale)
+    for values in maps:
+        assert values.shape == cells
+        assert torch.isfinite(values).all()
+    assert (seen.blur_px > 0).all()
+
+
+def test_the_papers_pair_has_its_size() -> None:
+    assert parameter_count(make_pair("paper")) == pytest.approx(3.7e6, rel=0.02)
+
+
+def test_ours_is_compact() -> None:
+    assert parameter_count(make_pair("compact")) < 0.7e6
+
+
+def test_ours_keeps_each_hypothesis_on_its_side_of_focus() -> None:
+    _, told = run_pair(make_pair("compact"), batch())
+    assert (told.log_ratio_near <= 0).all()
+    assert (told.log_ratio_far >= 0).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_weight_learns_from_the_joint_loss(kind: Kind) -> None:
+    pair = make_pair(kind)
+    loss, parts = total_loss(pair, batch(), TrainConfig(kind=kind))
+    loss.backward()  # type: ignore[no-untyped-call]
+    assert set(parts) == {"loss", "blur", "depth", "side"}
+    for name, weight in pair.modules().named_parameters():
+        assert weight.grad is not None, name
+        assert torch.isfinite(weight.grad).all(), name
+
+
+def test_b_weight_scales_the_blur_loss_alone() -> None:
+    pair = make_pair("compact")
+    pair.modules().eval()
+    with torch.no_grad():
+        zero, one, two = (float(total_loss(pair, batch(), TrainConfig(b_weight=w))[0]) for w in (0.0, 1.0, 2.0))
+    assert two - one == pytest.approx(one - zero, rel=1e-4)
+
+
+def test_band_energies_fall_with_blur_finest_first() -> None:
+    torch.manual_seed(1)
+    sharp = torch.rand(1, 3, 128, 128)
+    front = BandEnergy()
+    lost = (front(sharp) - front(blur(sharp, 1.5))).mean((0, 2, 3))
+    assert (lost[:8] > 0).all()
+    assert lost[0] > lost[4] > lost[9]
+
+
+def test_correction_takes_the_camera_out() -> None:
+    """The same scene by two cameras: other blur, the same relative defocus."""
+    pair = make_pair("compact")
+    seen = pair.blur(batch().image)
+    wider = type(seen)(seen.blur_px * 3, seen.log_error, seen.features)
+    ones = torch.ones(2)
+    one, _ = correct(seen, 0.1 * ones, 2 * ones, 0.0)
+    other, _ = correct(wider, 0.3 * ones, 6 * ones, 0.0)
+    torch.testing.assert_close(one, other)

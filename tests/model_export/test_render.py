@@ -1,0 +1,133 @@
+"""The refocuser: nothing made, nothing lost, nothing given away at an edge."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from model_export.render import (
+    Layer,
+    blur,
+    blur_levels,
+    blur_varying,
+    composite,
+    decode_srgb,
+    encode_srgb,
+    refocus,
+    render_layers,
+)
+from service.optics.camera import Camera
+
+CAMERA = Camera(96, 96, 2.0, 3.81, 0.5)
+Map = NDArray[np.float32]
+
+
+def step_depth(near: float, far: float, size: int = 96) -> Map:
+    depth = np.full((size, size), far, np.float32)
+    depth[:, : size // 2] = near
+    return depth
+
+
+def rough_depth(size: int = 96) -> Map:
+    u, v = np.meshgrid(np.linspace(0, 1, size), np.linspace(0, 1, size))
+    return (0.5 + 2 * u + 0.5 * np.sin(9 * v)).clip(0.4, 4).astype(np.float32)
+
+
+@pytest.mark.parametrize("depth", [step_depth(0.5, 3.0), step_depth(3.0, 0.5), rough_depth()])
+@pytest.mark.parametrize("shade", [0.0, 0.37, 1.0])
+def test_a_constant_image_stays_constant(depth: Map, shade: float) -> None:
+    image = np.full((96, 96, 3), shade, np.float32)
+    assert np.abs(refocus(image, depth, CAMERA) - shade).max() < 2e-3
+
+
+@pytest.mark.parametrize("disc_share", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("sigma", [0.7, 2.0, 6.0])
+def test_a_point_keeps_its_energy_and_gets_the_standard_deviation_asked_for(disc_share: float, sigma: float) -> None:
+    point = torch.zeros(1, 129, 129)
+    point[0, 64, 64] = 1
+    spread = blur(point, sigma, disc_share)[0].double()
+    offsets = torch.arange(-64, 65).double()
+    assert float(spread.sum()) == pytest.approx(1, abs=1e-5)
+    assert float((spread.sum(0) * offsets**2).sum()) == pytest.approx(sigma**2, rel=0.02)
+
+
+def test_energy_is_kept_on_a_slanted_surface() -> None:
+    rng = np.random.default_rng(0)
+    image = rng.random((96, 96, 3)).astype(np.float32)
+    before = decode_srgb(image).mean()
+    after = decode_srgb(refocus(image, rough_depth(), CAMERA)).mean()
+    assert after == pytest.approx(before, rel=0.03)
+
+
+@pytest.mark.parametrize(("near", "far"), [(0.5, 2.0), (2.0, 6.0), (0.6, 6.0)])
+def test_no_halo_at_a_depth_edge(near: float, far: float) -> None:
+    """Across an edge from dark to bright the picture only rises: no rim darker or brighter than both sides."""
+    image = np.full((96, 96, 3), 0.8, np.float32)
+    image[:, :48] = 0.2
+    across = refocus(image, step_depth(near, far), CAMERA)[48, :, 0]
+    assert np.diff(across).min() > -2e-3
+    assert across[0] == pytest.approx(0.2, abs=2e-3)
+    assert across[-1] == pytest.approx(0.8, abs=2e-3)
+
+
+def test_a_sharp_occluder_keeps_a_sharp_edge_before_a_blurred_ground() -> None:
+    image = np.full((96, 96, 3), 0.8, np.float32)
+    image[:, :48] = 0.2
+    camera = Camera(96, 96, 2.0, 8.0, 0.0)
+    in_front = refocus(image, step_depth(2.0, 8.0), camera)[48, :, 0]
+    behind = refocus(image, step_depth(8.0, 2.0), camera)[48, :, 0]
+    # the edge belongs to whichever surface is nearer: in both pictures the nearer one is in focus or not
+    assert in_front[50] == pytest.approx(0.8, abs=0.02)
+    assert behind[45] == pytest.approx(0.2, abs=0.02)
+
+
+def test_a_blurred_occluder_spills_over_a_sharp_ground() -> None:
+    image = np.full((96, 96, 3), 0.8, np.float32)
+    image[:, :48] = 0.2
+    across = refocus(image, step_depth(0.5, 2.0), Camera(96, 96, 2.0, 2.0, 0.0))[48, :, 0]
+    assert across[46] > 0.25
+    assert across[50] < 0.75
+
+
+def test_in_focus_nothing_changes() -> None:
+    rng = np.random.default_rng(1)
+    image = rng.random((64, 64, 3)).astype(np.float32)
+    picture = refocus(image, np.full((64, 64), 2.0, np.float32), Camera(64, 64, 2.0, 5.0, 0.0))
+    np.testing.assert_allclose(picture, image, atol=2e-3)
+
+
+def test_two_levels_of_blur_pass_for_the_one_between() -> None:
+    point = torch.zeros(1, 128, 128)
+    point[0, 64, 64] = 1
+    levels = blur_levels(2.0, 4.0)
+    middle = (levels[0] + levels[1]) / 2
+    sigma = torch.full((128, 128), middle)
+    sigma[0, 0], sigma[0, 1] = 2.0, 4.0
+    mixed, exact = blur_varying(point, sigma, 0.0)[0], blur(point, middle, 0.0)[0]
+    offsets = torch.arange(-64, 64)
+    assert float((mixed.sum(0) * offsets**2).sum()) == pytest.approx(middle**2, rel=5e-3)
+    assert float((mixed - exact).abs().max()) < 0.08 * float(exact.max())
+
+
+def test_a_scene_of_one_shade_stays_that_shade_through_all_its_layers() -> None:
+    size, shade = 64, 0.25
+    alpha = torch.zeros(1, size, size)
+    alpha[:, 20:40, 20:40] = 1
+    far = torch.full((size, size), 2.0)
+    near = torch.full((size, size), 5.0)
+    layers = [Layer(shade * alpha.repeat(3, 1, 1), alpha, near)]
+    layers.append(Layer(torch.full((3, size, size), shade), torch.ones(1, size, size), far))
+    np.testing.assert_allclose(render_layers(layers, 1.0).numpy(), shade, atol=1e-4)
+
+
+def test_nothing_to_render_is_an_error() -> None:
+    with pytest.raises(ValueError, match="no layers"):
+        composite([])
+
+
+def test_srgb_survives_the_round_trip() -> None:
+    values = np.linspace(0, 1, 257, dtype=np.float32)
+    np.testing.assert_allclose(encode_srgb(decode_srgb(values)), values, atol=1e-4)
+    assert math.isclose(float(decode_srgb(np.array([0.5], np.float32))[0]), 0.21404, rel_tol=1e-3)

@@ -1,0 +1,41 @@
+"""Procedural scenes: the same seed is the same scene, and every scene is what its shot says."""
+
+import numpy as np
+import pytest
+
+from model_export.config import SceneConfig
+from model_export.scenes import draw_sample, true_blur_px
+
+CONFIG = SceneConfig(size_px=64, margin_px=24)
+SEEDS = range(30)
+
+
+def test_a_seed_is_a_scene() -> None:
+    first, again, other = draw_sample(5, CONFIG, []), draw_sample(5, CONFIG, []), draw_sample(6, CONFIG, [])
+    assert first.shot == again.shot
+    np.testing.assert_array_equal(first.image, again.image)
+    np.testing.assert_array_equal(first.excess, again.excess)
+    assert not np.array_equal(first.image, other.image)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_scene_keeps_to_its_ranges(seed: int) -> None:
+    sample = draw_sample(seed, CONFIG, [])
+    shot, excess = sample.shot, sample.excess.astype(np.float32)
+    assert sample.image.shape == (3, 64, 64)
+    assert CONFIG.k_cam_px[0] <= shot.k_cam_px <= CONFIG.k_cam_px[1]
+    assert CONFIG.gamma_px[0] <= shot.gamma_px <= CONFIG.gamma_px[1]
+    ratio = 1 / (1 + excess)
+    assert ratio.min() > CONFIG.depth_ratio[0] * 0.99
+    assert ratio.max() < CONFIG.depth_ratio[1] * 1.01
+    assert true_blur_px(sample).max() <= np.hypot(CONFIG.defocus_px[1], shot.gamma_px) * 1.01
+    if shot.side < 0:
+        assert excess.min() >= 0
+    if shot.side > 0:
+        assert excess.max() <= 0
+
+
+def test_all_sides_and_lens_shapes_turn_up() -> None:
+    shots = [draw_sample(seed, SceneConfig(size_px=32, margin_px=8), []).shot for seed in range(60)]
+    assert {shot.side for shot in shots} == {-1, 0, 1}
+    assert {0.0, 1.0} < {shot.disc_share for shot in shots}

@@ -1,0 +1,94 @@
+"""Training: one seed is one run, stopped or not, and a run learns."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+
+from model_export.config import SceneConfig, TrainConfig
+from model_export.scenes import draw_sample
+from model_export.train import Checkpoint, Trainer, collate, learning_rate, train
+
+SCENES = SceneConfig(size_px=32, margin_px=8)
+CONFIG = TrainConfig(steps=6, batch=2, pool=8, fresh_per_step=1, checkpoint_every=3, warmup_steps=2, scenes=SCENES)
+
+
+@pytest.fixture
+def textures(tmp_path: Path) -> Path:
+    folder = tmp_path / "textures"
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    cv2.imwrite(str(folder / "noise.png"), rng.integers(0, 255, (90, 120, 3), np.uint8))
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def run(config: TrainConfig, textures: Path, folder: Path) -> tuple[Checkpoint, str]:
+    said = StringIO()
+    path = train(config, textures, folder, workers=0, console=Console(file=said, width=200))
+    return Checkpoint.load(path), said.getvalue()
+
+
+def test_a_run_reports_and_ends_in_a_checkpoint(textures: Path, tmp_path: Path) -> None:
+    checkpoint, said = run(CONFIG, textures, tmp_path / "run")
+    assert checkpoint.step == 6
+    assert checkpoint.config == CONFIG
+    assert "step 3: loss" in said
+    assert "held out" in said
+
+
+def test_a_stopped_run_goes_on_as_if_it_had_not_been_stopped(textures: Path, tmp_path: Path) -> None:
+    whole, _ = run(CONFIG, textures, tmp_path / "whole")
+    (tmp_path / "stopped").mkdir()
+    first, _ = run(CONFIG, textures, tmp_path / "stopped")
+    assert first.step == 6
+    halfway = Trainer(CONFIG, "cpu")
+    from model_export.textures import load_photographs
+    from model_export.train import Pool
+
+    pool = Pool(CONFIG, load_photographs(textures), 0, 0)
+    list(pool.fill())
+    for step in range(3):
+        halfway.advance(pool.batch(step))
+    halfway.checkpoint().save(tmp_path / "stopped" / "checkpoint.pt")
+    resumed, _ = run(CONFIG, textures, tmp_path / "stopped")
+    for name, weight in whole.modules.items():
+        torch.testing.assert_close(resumed.modules[name], weight, msg=name)
+
+
+def test_a_few_steps_on_one_batch_lower_the_loss() -> None:
+    config = replace(CONFIG, steps=1000)
+    samples = [draw_sample(seed, SCENES, []) for seed in range(4)]
+    batch = collate(samples, np.random.default_rng(0))
+    trainer = Trainer(config, "cpu")
+    losses = [trainer.advance(batch)["loss"] for _ in range(25)]
+    assert np.mean(losses[-5:]) < np.mean(losses[:5])
+
+
+def test_the_learning_rate_warms_up_holds_and_falls_to_nothing() -> None:
+    config = TrainConfig(steps=1000, warmup_steps=100)
+    assert learning_rate(config, 0) < learning_rate(config, 50) < learning_rate(config, 100)
+    assert learning_rate(config, 100) == learning_rate(config, 600) == config.learning_rate
+    assert learning_rate(config, 999) < 0.01 * config.learning_rate
+
+
+def test_a_config_survives_json() -> None:
+    assert TrainConfig.from_dict(CONFIG.as_dict()) == CONFIG
+
+
+def test_a_folder_without_pictures_is_said(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no JPEG or PNG"):
+        train(CONFIG, tmp_path, tmp_path / "run", workers=0)
