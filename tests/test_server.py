@@ -189,6 +189,18 @@ def test_a_body_that_grows_too_large_is_refused_while_it_comes(server: Server) -
     connection.close()
 
 
+def test_answers_do_not_wait_for_acknowledgements(server: Server) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=10)
+    durations_s = []
+    for _ in range(20):
+        started = time.monotonic()
+        connection.request("GET", "/health/live")
+        connection.getresponse().read()
+        durations_s.append(time.monotonic() - started)
+    connection.close()
+    assert min(durations_s) < 0.03
+
+
 def test_the_log_has_one_json_event_a_request(server: Server) -> None:
     server.request("GET", "/cameras/nobody", headers={"X-Request-Id": "find-me"})
 

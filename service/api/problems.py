@@ -117,7 +117,9 @@ def _example(error: type[CamindError]) -> dict[str, Any]:
 
 def invalid_request(faults: Sequence[Mapping[str, Any]]) -> BadRequest:
     """Pydantic's faults as one error; what the client sent is never echoed, only where it went wrong."""
-    fields = tuple(FieldProblem(_pointer(fault), _detail(fault)) for fault in faults)
+    # an unknown field often is the missing one, wrongly named: it explains most, so it comes first
+    ordered = sorted(faults, key=lambda fault: bool(fault["type"] != "extra_forbidden"))
+    fields = tuple(FieldProblem(_pointer(fault), _detail(fault)) for fault in ordered)
     first = fields[0]
     where = first.pointer.removeprefix("#").strip("/").replace("/", ".")
     return BadRequest(f"{where}: {first.detail}" if where else first.detail, errors=fields)
@@ -126,7 +128,7 @@ def invalid_request(faults: Sequence[Mapping[str, Any]]) -> BadRequest:
 def _pointer(fault: Mapping[str, Any]) -> str:
     source, *path = fault["loc"] or ("body",)
     if fault["type"] == "json_invalid" or (source == "body" and not path):
-        return "#" + str(fault.get("ctx", {}).get("pointer", ""))
+        return "#"
     if source != "body":
         return ".".join(map(_printable, path)) or str(source)
     return "#" + "".join(f"/{_printable(part).replace('~', '~0').replace('/', '~1')}" for part in path)
@@ -141,7 +143,7 @@ def _detail(fault: Mapping[str, Any]) -> str:
 
 
 def _unknown_field(name: str) -> str:
-    if "35" in name:
+    if re.search("35_?mm|equivalent", name, re.IGNORECASE):
         return (
             "A 35-mm-equivalent focal length is not the lens' focal length, and k_cam grows with its square: "
             "send the real one as focal_length_mm (printed on the lens, and FocalLength in EXIF)."

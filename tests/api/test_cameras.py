@@ -204,12 +204,14 @@ def test_a_lens_longer_than_its_focus_distance_is_refused(
 def test_an_equivalent_focal_length_is_explained(
     client: TestClient, d200: dict[str, Any], place: str, name: str
 ) -> None:
+    del d200["lens"]["focal_length_mm"]
     (d200["lens"] if place == "lens" else d200)[name] = 52
     answer = client.post("/cameras", json=d200)
     assert answer.status_code == 422
     fault = answer.json()["errors"][0]
     assert fault["pointer"] == (f"#/lens/{name}" if place == "lens" else f"#/{name}")
     assert "35-mm-equivalent" in fault["detail"]
+    assert "35-mm-equivalent" in answer.json()["detail"]
     assert "focal_length_mm" in fault["detail"]
 
 
