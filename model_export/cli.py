@@ -1,6 +1,8 @@
 """What training adds to the command ``camind``: train, export, verify, evaluate."""
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -27,6 +29,15 @@ def _fail(message: str) -> typer.Exit:
     return typer.Exit(1)
 
 
+@contextmanager
+def _training_parts() -> Iterator[None]:
+    """Around the imports that need torch: what is missing is said with its remedy."""
+    try:
+        yield
+    except ModuleNotFoundError as exc:
+        raise _fail(f"{exc.name} is not installed: pip install 'camind[train]' brings it") from exc
+
+
 @commands.command()
 def train(
     run: Annotated[Path, typer.Option(help="folder of the run: its checkpoint lies there and is gone on from")],
@@ -38,8 +49,9 @@ def train(
     device: Annotated[str, typer.Option(help="torch device")] = "cpu",
 ) -> None:
     """Train a pair of networks on procedural scenes; stop and start it as you like."""
-    from model_export.config import TrainConfig
-    from model_export.train import train as run_training
+    with _training_parts():
+        from model_export.config import TrainConfig
+        from model_export.train import train as run_training
 
     if kind not in {"compact", "paper"}:
         raise _fail(f"--kind is compact or paper, not {kind}")
@@ -59,7 +71,8 @@ def export(
     name: Annotated[str | None, typer.Option(help="name of the model")] = None,
 ) -> None:
     """Write a checkpoint as a model folder: two ONNX graphs, card and manifest."""
-    from model_export.export import export_checkpoint
+    with _training_parts():
+        from model_export.export import export_checkpoint
 
     manifest = export_checkpoint(checkpoint, textures, out, name)
     typer.echo(f"{manifest.name} in {out}")
@@ -68,7 +81,8 @@ def export(
 @commands.command()
 def verify(checkpoint: Checkpoint, model: Model = DEFAULT_MODEL) -> None:
     """Compare torch with ONNX Runtime on three sizes; fails above 1e-3 relative."""
-    from model_export.verify import TOLERANCE, verify_checkpoint
+    with _training_parts():
+        from model_export.verify import TOLERANCE, verify_checkpoint
 
     differences = verify_checkpoint(checkpoint, model)
     Console().print(_differences(differences))
@@ -95,7 +109,8 @@ def evaluate(
     update_card: Annotated[bool, typer.Option(help="write the scores into the model's card and manifest")] = False,
 ) -> None:
     """Score a model on pictures that no training saw, beside the best constant depth of each picture."""
-    from model_export.evaluate import evaluate as run_evaluation
+    with _training_parts():
+        from model_export.evaluate import evaluate as run_evaluation
 
     console = Console(stderr=True)
     with console.status("loading") as status:

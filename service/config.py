@@ -51,12 +51,12 @@ class Settings(BaseSettings):
     workers: Annotated[int, Field(ge=0, le=64, description="Images worked on at a time; 0: cores / 2")] = 0
     intra_op_threads: Annotated[int, Field(ge=0, le=64, description="Threads per image; 0: cores / workers")] = 0
     queue_size: Annotated[int, Field(ge=0, le=1000, description="Images that may wait for a worker")] = 16
-    deadline_s: Annotated[float, Field(gt=0, le=600, description="Longest wait and work for one image")] = 30.0
+    deadline_s: Annotated[float, Field(gt=0, le=600, description="Longest wait and work for one image")] = 120.0
 
     max_image_bytes: Annotated[
         int, Field(ge=1_000, le=1_000_000_000, description="Largest request body with an image")
     ] = 40_000_000
-    max_image_pixels: Annotated[int, Field(ge=1_000, le=500_000_000, description="Largest image, width x height")] = (
+    max_image_pixels: Annotated[int, Field(ge=1_000, le=100_000_000, description="Largest image, width x height")] = (
         24_000_000
     )
     max_json_bytes: Annotated[

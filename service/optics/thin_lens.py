@@ -84,9 +84,7 @@ def defocus_from_blur(blur_px: Q, gamma_px: Q | float, floor_px: float = 0.0) ->
     return sigma
 
 
-def relative_defocus_from_blur(
-    blur_px: Q, gamma_px: Q | float, k_cam_px: Q | float, floor_px: float = 0.0
-) -> Q:
+def relative_defocus_from_blur(blur_px: Q, gamma_px: Q | float, k_cam_px: Q | float, floor_px: float = 0.0) -> Q:
     """x = sqrt(lambda^2 - gamma^2) / k_cam, without unit (eq. 7)."""
     x: Q = defocus_from_blur(blur_px, gamma_px, floor_px) / k_cam_px
     return x
@@ -119,9 +117,7 @@ def depth_far(relative_defocus: Q, focus_distance_m: Q | float) -> Q:
     return z
 
 
-def depth_error(
-    depth_m: Q, focus_distance_m: Q | float, k_cam_px: Q | float, defocus_error_px: Q | float
-) -> Q:
+def depth_error(depth_m: Q, focus_distance_m: Q | float, k_cam_px: Q | float, defocus_error_px: Q | float) -> Q:
     """dz = z^2 / (s1 k_cam) dsigma in metres: the floor under every depth error."""
     dz: Q = depth_m * depth_m / (focus_distance_m * k_cam_px) * defocus_error_px
     return dz

@@ -1,0 +1,25 @@
+# The service: no torch, no onnx, no compiler, no root, nothing written but /data.
+FROM python:3.11-slim-bookworm AS build
+COPY pyproject.toml README.md LICENSE /src/
+COPY service /src/service
+COPY model_export /src/model_export
+COPY migrations /src/migrations
+WORKDIR /src
+RUN python3 -m venv /opt/camind
+RUN /opt/camind/bin/python -m pip install --no-cache-dir ".[postgres]"
+
+FROM python:3.11-slim-bookworm
+RUN useradd --system --uid 10001 --home-dir /data --create-home camind
+COPY --from=build /opt/camind /opt/camind
+ENV PATH=/opt/camind/bin:$PATH \
+    PYTHONDONTWRITEBYTECODE=1 \
+    PYTHONUNBUFFERED=1 \
+    CAMIND_DATA_DIR=/data \
+    CAMIND_HOST=0.0.0.0 \
+    CAMIND_LOG_FORMAT=json
+USER 10001
+VOLUME /data
+EXPOSE 8000
+HEALTHCHECK --interval=30s --timeout=3s --start-period=20s CMD ["python3", "-c", "import urllib.request as u; u.urlopen('http://127.0.0.1:8000/health/ready', timeout=2)"]
+ENTRYPOINT ["camind"]
+CMD ["serve"]
