@@ -6,6 +6,7 @@ from contextlib import asynccontextmanager
 from importlib.metadata import version
 
 from fastapi import FastAPI
+from fastapi_offline import FastAPIOffline
 
 from service.api import cameras, depth, handlers, health, metrics, model, openapi, pages
 from service.config import Settings
@@ -32,7 +33,7 @@ TAGS = [
 
 def create_app(settings: Settings) -> FastAPI:
     """The app for these settings; nothing is opened or loaded before it starts."""
-    app = FastAPI(
+    app = FastAPIOffline(
         title="camind",
         version=version("camind"),
         summary="Metres from one photograph, for any camera",
