@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 OVERSAMPLE = 2
 KINDS = ("photo", "leaves", "noise", "drawing")
-KIND_SHARES = (0.5, 0.2, 0.15, 0.15)
+KIND_SHARES = (0.57, 0.2, 0.08, 0.15)
+FADED_SHARE = 0.5
 LETTERS = "ABCDEFGHJKLMNPRSTUVXYZabcdefghkmnoprstuvxyz0123456789&%#?"
 
 Image = NDArray[np.float32]
@@ -39,6 +40,8 @@ def draw_texture(rng: np.random.Generator, photographs: list[NDArray[np.uint8]],
         texture = _drawing(rng, size)
     else:
         texture = _noise(rng, size)
+    if rng.random() < FADED_SHARE:
+        texture = _faded(rng, texture)
     return _recolor(rng, texture)
 
 
@@ -89,7 +92,7 @@ def _leaves(rng: np.random.Generator, size: int) -> Image:
 def _noise(rng: np.random.Generator, size: int) -> Image:
     """Noise whose amplitude falls as frequency to a random power, per channel partly the same."""
     frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None, :])
-    amplitude = np.maximum(frequency, 1 / size) ** -rng.uniform(0.4, 1.6)
+    amplitude = np.maximum(frequency, 1 / size) ** -rng.uniform(0.3, 1.2)
     shared = rng.uniform(0.3, 1.0)
     white = rng.standard_normal((4, size, size))
     white[:3] = shared * white[3] + (1 - shared) * white[:3]
@@ -120,6 +123,25 @@ def _drawing(rng: np.random.Generator, size: int) -> Image:
             end = rng.integers(-40, span + 40, 2).tolist()
             cv2.line(canvas, (x, y), (end[0], end[1]), _shade(rng), int(rng.integers(1, 9)))
     return _shrink(canvas, size)
+
+
+def _smooth_field(rng: np.random.Generator, size: int) -> NDArray[np.float32]:
+    """A random map [size, size] in about -2..2 that varies over a third of the canvas or more."""
+    coarse = rng.standard_normal((int(rng.integers(2, 6)),) * 2).astype(np.float32)
+    return np.asarray(cv2.resize(coarse, (size, size), interpolation=cv2.INTER_CUBIC), np.float32)
+
+
+def _faded(rng: np.random.Generator, texture: Image) -> Image:
+    """The texture gone faint, everywhere or in parts: walls and table tops are flat at any blur."""
+    size = texture.shape[0]
+    faint = rng.uniform(0, 0.2)
+    if rng.random() < 0.25:
+        strength = np.full((size, size, 1), faint + 0.02, np.float32)
+    else:
+        edge = (_smooth_field(rng, size) + rng.uniform(-0.8, 0.8)) * np.float32(rng.uniform(2, 8))
+        strength = (faint + (1 - faint) / (1 + np.exp(-edge)))[..., None].astype(np.float32)
+    ground = texture.mean((0, 1)) * (1 + 0.1 * _smooth_field(rng, size)[..., None])
+    return np.asarray(np.clip(ground + (texture - ground) * strength, 0, 1), np.float32)
 
 
 def _recolor(rng: np.random.Generator, texture: Image) -> Image:

@@ -90,6 +90,7 @@ def _start(app: FastAPI) -> None:
     app.state.worker = Worker(
         slots=settings.worker_slots, queue_size=settings.queue_size, deadline_s=settings.deadline_s
     )
+    app.state.metrics.in_flight.set_function(lambda: app.state.worker.in_flight)
     app.state.is_warm = True
 
 

@@ -4,15 +4,13 @@ import json
 import os
 import re
 import shutil
-import socket
 import subprocess
 import sys
-import time
-import urllib.request
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from tests.server import serving
 
 ROOT = Path(__file__).parents[1]
 SERVICE = (ROOT / "docker" / "service.Dockerfile").read_text()
@@ -58,41 +56,6 @@ def copy_into(source: Path, place: Path) -> None:
         shutil.copy(source, place)
 
 
-def environment(data: Path) -> dict[str, str]:
-    return {"PATH": "/usr/bin:/bin", "CAMIND_DATA_DIR": str(data), "HOME": str(data), "LANG": "C.UTF-8"}
-
-
-@pytest.fixture(scope="module")
-def port(image: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
-    """The app started from the image's venv, away from the checkout."""
-    data = tmp_path_factory.mktemp("data")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        number = int(probe.getsockname()[1])
-    command = [str(image / "bin" / "camind"), "serve", "--port", str(number)]
-    with (data / "log").open("w") as log:
-        process = subprocess.Popen(command, cwd=data, env=environment(data), stdout=log, stderr=log)
-    try:
-        wait_until_ready(number, process, data / "log")
-        yield number
-    finally:
-        process.terminate()
-        process.wait(20)
-
-
-def wait_until_ready(port: int, process: "subprocess.Popen[bytes]", log: Path) -> None:
-    for _ in range(300):
-        if process.poll() is not None:
-            pytest.fail(f"the service ended: {log.read_text()}")
-        try:
-            with urllib.request.urlopen(f"http://127.0.0.1:{port}/health/ready", timeout=2) as answer:
-                assert answer.status == 200
-                return
-        except OSError:
-            time.sleep(0.2)
-    pytest.fail(f"not ready after a minute: {log.read_text()}")
-
-
 def test_the_image_holds_no_training(image: Path) -> None:
     listed = subprocess.run(
         [str(image / "bin" / "python"), "-m", "pip", "list", "--format", "json"], capture_output=True, check=True
@@ -102,22 +65,17 @@ def test_the_image_holds_no_training(image: Path) -> None:
     assert {"onnxruntime", "psycopg", "fastapi"} <= installed
 
 
-def test_the_app_starts_from_the_image_and_serves_the_shipped_model(port: int) -> None:
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}/model", timeout=5) as answer:
-        assert json.load(answer)["manifest"]["kind"] == "compact"
+def test_the_app_starts_from_the_image_and_serves_the_shipped_model(image: Path, tmp_path: Path) -> None:
+    with serving(tmp_path / "data", camind=image / "bin" / "camind") as server:
+        assert server.ask("GET", "/model").json()["manifest"]["kind"] == "compact"
 
 
 def test_training_commands_are_refused_in_plain_words_without_torch(image: Path, tmp_path: Path) -> None:
-    done = subprocess.run(
-        [str(image / "bin" / "camind"), "verify", "--checkpoint", os.devnull],
-        env=environment(tmp_path),
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-    )
+    command: list[str | Path] = [image / "bin" / "camind", "verify", "--checkpoint", os.devnull]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode != 0
     assert "Traceback" not in done.stderr
-    assert "train" in done.stderr
+    assert "camind[train]" in done.stderr
 
 
 def test_the_service_runs_as_nobody_in_particular() -> None:

@@ -2,101 +2,29 @@
 
 import http.client
 import json
-import os
-import re
 import signal
 import socket
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import pytest
 
-CAMIND = Path(sys.executable).parent / "camind"
-START_S = 60
+from tests.server import Server
+from tests.server import serving as start
+
 RECEIVE_DEADLINE_S = 1.0
-T = TypeVar("T")
-CAMERA = {"image_width_px": 4, "image_height_px": 3, "focus_distance_m": 1.0, "k_cam_px": 2.0}
 
 
-class Server:
-    """A started ``camind serve`` on a port the system chose."""
-
-    def __init__(self, data_dir: Path, model_dir: Path) -> None:
-        environment = {
-            **os.environ,
-            "CAMIND_DATA_DIR": str(data_dir),
-            "CAMIND_RECEIVE_DEADLINE_S": str(RECEIVE_DEADLINE_S),
-            "CAMIND_MAX_IMAGE_BYTES": "200000",
-            "CAMIND_LOG_FORMAT": "json",
-        }
-        self._log = data_dir.parent / "server.log"
-        command: list[str | Path] = [CAMIND, "serve", "--port", "0", "--model", model_dir]
-        with self._log.open("w") as log:
-            self.process = subprocess.Popen(command, env=environment, stderr=log)
-        self.port = self._wait_for_port()
-        self._wait_until_ready()
-
-    @property
-    def log(self) -> str:
-        return self._log.read_text()
-
-    def connect(self) -> socket.socket:
-        return socket.create_connection(("127.0.0.1", self.port), timeout=10)
-
-    def request(
-        self, method: str, path: str, body: bytes | str | None = None, headers: dict[str, str] | None = None
-    ) -> tuple[int, dict[str, Any]]:
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=10)
-        try:
-            connection.request(method, path, body, headers or {})
-            answer = connection.getresponse()
-            return answer.status, json.loads(answer.read())
-        finally:
-            connection.close()
-
-    def add(self, name: str) -> int:
-        body = json.dumps({"name": name, **CAMERA})
-        return self.request("POST", "/cameras", body, {"Content-Type": "application/json"})[0]
-
-    def stop(self, number: int) -> int:
-        self.process.send_signal(number)
-        return self.process.wait(timeout=30)
-
-    def _wait_for_port(self) -> int:
-        def find() -> int | None:
-            found = re.search(r"camind on http://127\.0\.0\.1:(\d+)", self.log)
-            return int(found[1]) if found else None
-
-        return self.poll(find)
-
-    def _wait_until_ready(self) -> None:
-        self.poll(lambda: self.request("GET", "/health/ready")[0] == 200)
-
-    def poll(self, look: Callable[[], T | None]) -> T:
-        give_up = time.monotonic() + START_S
-        while time.monotonic() < give_up:
-            assert self.process.poll() is None, self.log
-            found = look()
-            if found:
-                return found
-            time.sleep(0.05)
-        raise AssertionError(f"not up within {START_S} s:\n{self.log}")
+def serving(data_dir: Path, model_dir: Path) -> AbstractContextManager[Server]:
+    settings = {"CAMIND_RECEIVE_DEADLINE_S": str(RECEIVE_DEADLINE_S), "CAMIND_MAX_IMAGE_BYTES": "200000"}
+    return start(data_dir, "--model", model_dir, settings=settings)
 
 
-@contextmanager
-def serving(data_dir: Path, model_dir: Path) -> Iterator[Server]:
-    server = Server(data_dir, model_dir)
-    try:
-        yield server
-    finally:
-        if server.process.poll() is None:
-            server.process.kill()
-            server.process.wait()
+def camera(name: str) -> dict[str, Any]:
+    return {"name": name, "image_width_px": 4, "image_height_px": 3, "focus_distance_m": 1.0, "k_cam_px": 2.0}
 
 
 @pytest.fixture(scope="module")
@@ -118,13 +46,13 @@ def read_to_end(connection: socket.socket) -> tuple[int, dict[str, str], bytes]:
 def test_what_was_acknowledged_survives_a_kill(tmp_path: Path, tiny_model_dir: Path) -> None:
     data_dir = tmp_path / "data"
     with serving(data_dir, tiny_model_dir) as first:
-        assert [first.add(f"camera-{number}") for number in range(5)] == [201] * 5
+        assert [first.add(camera(f"camera-{number}")) for number in range(5)] == [201] * 5
         assert first.stop(signal.SIGKILL) == -signal.SIGKILL
     with serving(data_dir, tiny_model_dir) as second:
-        status, page = second.request("GET", "/cameras")
-        assert status == 200
-        assert [camera["name"] for camera in page["items"]] == [f"camera-{number}" for number in range(5)]
-        assert second.add("camera-0") == 409
+        page = second.ask("GET", "/cameras")
+        assert page.status == 200
+        assert [item["name"] for item in page.json()["items"]] == [f"camera-{number}" for number in range(5)]
+        assert second.add(camera("camera-0")) == 409
         assert second.stop(signal.SIGTERM) in (0, -signal.SIGTERM)
 
 
@@ -202,7 +130,7 @@ def test_answers_do_not_wait_for_acknowledgements(server: Server) -> None:
 
 
 def test_the_log_has_one_json_event_a_request(server: Server) -> None:
-    server.request("GET", "/cameras/nobody", headers={"X-Request-Id": "find-me"})
+    server.ask("GET", "/cameras/nobody", headers={"X-Request-Id": "find-me"})
 
     def find() -> list[dict[str, Any]]:
         return [json.loads(line) for line in server.log.splitlines() if "find-me" in line]

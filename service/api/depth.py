@@ -144,6 +144,7 @@ async def estimate_depth(
         return Response(status_code=CLIENT_CLOSED_REQUEST)
     answer = outcome.value
     timings_ms = {**answer.timings_ms, "wait": outcome.wait_ms}
+    request.app.state.metrics.time_stages(timings_ms)
     return Response(
         answer.encoded.body,
         media_type=answer.encoded.media_type,

@@ -1,5 +1,7 @@
 """What the service counts about itself, in a registry of its own, and ``GET /metrics``."""
 
+from collections.abc import Mapping
+
 from fastapi import APIRouter, Request, Response
 from prometheus_client import (
     CONTENT_TYPE_LATEST,
@@ -34,6 +36,16 @@ class Metrics:
             buckets=DURATION_BUCKETS_S,
             registry=self.registry,
         )
+        self._stage_s = Histogram(
+            "camind_depth_stage_seconds",
+            "Time of each stage of a depth request",
+            ("stage",),
+            buckets=DURATION_BUCKETS_S,
+            registry=self.registry,
+        )
+        self.in_flight = Gauge(
+            "camind_depth_in_flight", "Photographs being worked on or waiting", registry=self.registry
+        )
         self.in_progress = Gauge("camind_requests_in_progress", "Requests being answered", registry=self.registry)
 
     def count(self, method: str, path_template: str | None, status: int, duration_s: float) -> None:
@@ -42,6 +54,11 @@ class Metrics:
         path = path_template or UNMATCHED
         self._requests.labels(method, path, str(status)).inc()
         self._duration_s.labels(method, path).observe(duration_s)
+
+    def time_stages(self, timings_ms: Mapping[str, float]) -> None:
+        """One answered depth request, milliseconds by stage."""
+        for stage, elapsed_ms in timings_ms.items():
+            self._stage_s.labels(stage).observe(elapsed_ms / 1e3)
 
 
 router = APIRouter(tags=["service"])

@@ -1,0 +1,106 @@
+"""The model in the repository, through the real service: the README's requests, and metres that are right."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from model_export.config import SceneConfig
+from model_export.render import refocus
+from model_export.textures import draw_texture
+from service.config import SHIPPED_MODEL
+from service.inference.artifact import load_model_folder
+from service.inference.estimator import Estimator
+from service.opencv import cv2
+from service.optics.camera import Camera
+from tests.server import Server, serving
+
+PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "coffee.jpg"
+MAX_BYTES = 12_000_000
+MAX_PEAK_BYTES = 600_000_000
+D200 = {
+    "name": "d200",
+    "image_width_px": 645,
+    "image_height_px": 432,
+    "focus_distance_m": 2.0,
+    "gamma_px": 0.5,
+    "lens": {"focal_length_mm": 35, "f_number": 2.8, "pixel_pitch_um": 6.05, "sensor_width_px": 3872},
+}
+REFERENCE = Camera(640, 480, 2.0, 3.81, 0.5)
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    with serving(tmp_path_factory.mktemp("shipped") / "data") as running:
+        assert running.add(D200) == 201
+        yield running
+
+
+def ask(server: Server, picture: bytes, query: str = "") -> bytes:
+    answer = server.ask("POST", f"/depth?camera=d200{query}", picture, {"Content-Type": "image/jpeg"})
+    assert answer.status == 200, answer.body
+    return answer.body
+
+
+def test_the_folder_is_whole_small_and_says_where_it_comes_from() -> None:
+    folder = load_model_folder(SHIPPED_MODEL)
+    assert sum(file.stat().st_size for file in SHIPPED_MODEL.iterdir()) < MAX_BYTES
+    assert "LICENCE" in folder.card().upper()
+    assert folder.manifest.scores
+    assert folder.manifest.ranges.k_cam_px.low == SceneConfig().k_cam_px[0]
+
+
+def test_the_readmes_picture_becomes_a_16_bit_map_of_its_size(server: Server) -> None:
+    raw = np.frombuffer(ask(server, PICTURE.read_bytes()), np.uint8)
+    depth_mm = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED)
+    assert depth_mm is not None
+    assert depth_mm.shape == (432, 645)
+    assert depth_mm.dtype == np.uint16
+    assert (depth_mm > 0).any()
+
+
+def test_the_readmes_point_has_metres_and_their_error(server: Server) -> None:
+    answer = json.loads(ask(server, PICTURE.read_bytes(), "&format=json&at=320,216"))
+    point = answer["points"][0]
+    assert (point["u"], point["v"]) == (320, 216)
+    if point["depth_m"] is not None:
+        assert 0 < point["sigma_m"] <= 0.5 * point["depth_m"]
+    assert answer["depth_m"]["min"] > 0
+
+
+def test_ten_frames_stay_below_600_megabytes(server: Server) -> None:
+    assert server.add({**D200, "name": "robot", "image_width_px": 640, "image_height_px": 480}) == 201
+    frame = cv2.imencode(".jpg", to_pixels(texture(1)))[1].tobytes()
+    for _ in range(10):
+        answer = server.ask("POST", "/depth?camera=robot", frame, {"Content-Type": "image/jpeg"})
+        assert answer.status == 200
+    assert server.peak_memory_bytes < MAX_PEAK_BYTES
+
+
+def texture(seed: int) -> NDArray[np.float32]:
+    square = draw_texture(np.random.default_rng(seed), [], 640)
+    return np.ascontiguousarray(square[:480])
+
+
+def to_pixels(picture: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return (picture * 255 + 0.5).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def estimator() -> Estimator:
+    return Estimator.from_folder(load_model_folder(SHIPPED_MODEL), intra_op_threads=1)
+
+
+@pytest.mark.parametrize("depth_m", [0.7, 1.0, 1.5])
+def test_a_textured_plane_stands_where_it_stands(estimator: Estimator, depth_m: float) -> None:
+    """Leaves, noise and text that no training drew, by a camera it never met: right to a tenth in the median."""
+    plane = np.full((480, 640), depth_m, np.float32)
+    errors = []
+    for seed in (11, 12, 13):
+        picture = to_pixels(refocus(texture(seed), plane, REFERENCE))
+        depth = estimator.estimate(picture, REFERENCE, "near").depth_m
+        errors.append(abs(float(np.nanmedian(depth)) / depth_m - 1))
+    assert np.median(errors) < 0.1
