@@ -67,7 +67,7 @@ def test_the_readmes_point_has_metres_and_their_error(server: Server) -> None:
     point = answer["points"][0]
     assert (point["u"], point["v"]) == (320, 216)
     if point["depth_m"] is not None:
-        assert 0 < point["sigma_m"] <= 0.5 * point["depth_m"]
+        assert 0 < point["sigma_m"] <= point["depth_m"]
     assert answer["depth_m"]["min"] > 0
 
 

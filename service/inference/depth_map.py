@@ -12,7 +12,7 @@ from service.inference.resampling import Axis, sample
 from service.optics import thin_lens
 from service.optics.camera import Camera
 
-MAX_RELATIVE_ERROR = 0.5
+MAX_RELATIVE_ERROR = 1.0
 SIGMA_OF_LAPLACE = np.float32(2**0.5)
 ROWS_AT_ONCE = 128
 

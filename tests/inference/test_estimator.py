@@ -126,7 +126,7 @@ def test_what_lies_outside_the_trained_ranges_is_said(estimator: Estimator) -> N
 
 
 def test_an_answer_that_is_too_unsure_is_none(tmp_path: Path) -> None:
-    unsure = Estimator.from_folder(load_model_folder(build_oracle_pair(tmp_path / "m", depth_scale=0.6)))
+    unsure = Estimator.from_folder(load_model_folder(build_oracle_pair(tmp_path / "m", depth_scale=0.8)))
     answer = unsure.estimate(grey(60), CAMERA, "near")
     assert not answer.valid.any()
     for hidden in (answer.depth_m, answer.depth_alt_m, answer.sigma_m):
