@@ -8,6 +8,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -290,12 +291,12 @@ def case_sets(data: Path, quick: bool) -> dict[str, Callable[[], Iterator[Case]]
     sets: dict[str, Callable[[], Iterator[Case]]] = {}
     if (data / "rgbd").is_dir() and (data / "tabletop").is_dir():
         for distance in PLANES_M:
-            sets[f"plane_{distance:g}m"] = lambda distance=distance: plane_cases(data, distance, few)  # type: ignore[misc]
+            sets[f"plane_{distance:g}m"] = partial(plane_cases, data, distance, few)
     for name in ("rgbd", "tabletop"):
         if (data / name).is_dir():
-            sets[name] = lambda name=name: refocused_cases(data / name, many)  # type: ignore[misc]
+            sets[name] = partial(refocused_cases, data / name, many)
     if (data / "d200").is_dir():
-        sets["d200"] = lambda: d200_cases(data / "d200", 2 * many)
+        sets["d200"] = partial(d200_cases, data / "d200", 2 * many)
     return sets
 
 
