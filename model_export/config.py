@@ -29,18 +29,19 @@ class TrainConfig:
 
     kind: Kind = "compact"
     seed: int = 1
-    steps: int = 7_000
+    steps: int = 6_400
     batch: int = 12
-    learning_rate: float = 2e-3
+    learning_rate: float = 1e-3
     weight_decay: float = 1e-4
     warmup_steps: int = 200
-    decay_share: float = 0.3
+    decay_share: float = 0.5
     clip_norm: float = 1.0
     b_weight: float = 1.0
     side_weight: float = 0.1
-    pool: int = 2000
-    fresh_per_step: int = 2
+    pool: int = 1500
+    fresh_per_step: int = 3
     checkpoint_every: int = 250
+    settle_batches: int = 60
     scenes: SceneConfig = field(default_factory=SceneConfig)
 
     def as_dict(self) -> dict[str, Any]:

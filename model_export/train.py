@@ -6,7 +6,7 @@ is one run, however fast the scene workers are and however often it is stopped.
 
 import os
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from rich.progress import (
 from torch.utils.data import DataLoader, Dataset
 
 from model_export.config import SceneConfig, TrainConfig
-from model_export.losses import Batch, total_loss
+from model_export.losses import Batch, run_pair, total_loss
 from model_export.networks import Pair, make_pair
 from model_export.scenes import Sample, draw_sample
 from model_export.textures import load_photographs
@@ -97,10 +97,12 @@ class Pool:
     def batch(self, step: int) -> Batch:
         """The batch of a step: scenes, flips, hints and all follow from seed and step."""
         rng = np.random.default_rng((self.config.seed, step))
-        chosen = [self.samples[i] for i in rng.integers(0, len(self.samples), self.config.batch)]
+        return collate([self.samples[i] for i in rng.integers(0, len(self.samples), self.config.batch)], rng)
+
+    def refresh(self) -> None:
+        """Let in the new scenes of one step; as many old ones go."""
         for _ in range(self.config.fresh_per_step):
             self.samples.append(next(self.stream))
-        return collate(chosen, rng)
 
 
 def collate(samples: list[Sample], rng: np.random.Generator) -> Batch:
@@ -208,6 +210,23 @@ class Trainer:
         self.step += 1
         return {name: float(part) for name, part in parts.items()}
 
+    def settle(self, batches: Iterable[Batch]) -> None:
+        """Set every batch norm to the plain mean over batches, seen with the weights as they are now.
+
+        The running averages of training follow the last ten batches, which is noise in large blur.
+        """
+        norms = [m for m in self.modules.modules() if isinstance(m, torch.nn.BatchNorm2d)]
+        momenta = [norm.momentum for norm in norms]
+        self.modules.train()
+        for norm in norms:
+            norm.reset_running_stats()
+            norm.momentum = None
+        with torch.no_grad(), self.autocast():
+            for batch in batches:
+                run_pair(self.pair, batch)
+        for norm, momentum in zip(norms, momenta, strict=True):
+            norm.momentum = momentum
+
     def validate(self, batch: Batch) -> dict[str, float]:
         """The loss's parts on held-out scenes, networks in evaluation mode."""
         self.modules.eval()
@@ -255,10 +274,15 @@ def train(
         recent: deque[dict[str, float]] = deque(maxlen=config.checkpoint_every)
         while trainer.step < config.steps:
             recent.append(trainer.advance(pool.batch(trainer.step)))
+            pool.refresh()
             progress.update(task, completed=trainer.step)
             if trainer.step % config.checkpoint_every == 0 or trainer.step == config.steps:
                 trainer.checkpoint().save(path)
                 console.print(_report(trainer.step, recent, trainer.validate(test)))
+    trainer.settle(pool.batch(config.steps + i) for i in range(config.settle_batches))
+    trainer.checkpoint().save(path)
+    settled = " ".join(f"{name} {value:.3f}" for name, value in trainer.validate(test).items())
+    console.print(f"settled: held out {settled}")
     return path
 
 
