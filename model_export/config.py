@@ -17,7 +17,7 @@ class SceneConfig:
     gamma_px: tuple[float, float] = (0.3, 1.6)
     focus_distance_m: tuple[float, float] = (0.2, 5.0)
     focal_length_px: tuple[float, float] = (150.0, 2500.0)
-    defocus_px: tuple[float, float] = (0.15, 20.0)
+    defocus_px: tuple[float, float] = (0.4, 20.0)
     depth_ratio: tuple[float, float] = (0.15, 8.0)
     max_layers: int = 6
     jpeg_quality: tuple[int, int] = (60, 98)
@@ -29,7 +29,7 @@ class TrainConfig:
 
     kind: Kind = "compact"
     seed: int = 1
-    steps: int = 6_400
+    steps: int = 6_100
     batch: int = 12
     learning_rate: float = 1e-3
     weight_decay: float = 1e-4
@@ -38,8 +38,8 @@ class TrainConfig:
     clip_norm: float = 1.0
     b_weight: float = 1.0
     side_weight: float = 0.1
-    pool: int = 1500
-    fresh_per_step: int = 3
+    pool: int = 1200
+    fresh_per_step: int = 2
     checkpoint_every: int = 250
     settle_batches: int = 60
     scenes: SceneConfig = field(default_factory=SceneConfig)

@@ -33,6 +33,9 @@ D200 = Lens(35.0, 2.8, 6.05, 3872)
 D200_LIMIT_M = 5.0
 D200_STEP = 0.05
 D200_STEP_MARGIN_PX = 25
+CELL_PX = 32
+CELL_CONTRAST = 0.03
+TEXTURED_SHARE = 0.6
 BLUR_BINS_PX = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, math.inf)
 PROCEDURAL_SCENES = 120
 SIDES: dict[int, Side] = {-1: "near", 0: "auto", 1: "far"}
@@ -94,11 +97,20 @@ def _sharp_texture(photo: Photo) -> Map:
     return np.asarray(tiled, np.float32) / np.float32(255)
 
 
+def _is_textured(texture: Map) -> bool:
+    """Whether most cells of 32 px have a contrast (standard deviation of brightness) above 3 %."""
+    height, width = (size // CELL_PX * CELL_PX for size in texture.shape[:2])
+    grey = texture[:height, :width].mean(2)
+    cells = grey.reshape(height // CELL_PX, CELL_PX, width // CELL_PX, CELL_PX).std((1, 3))
+    return float((cells > CELL_CONTRAST).mean()) >= TEXTURED_SHARE
+
+
 def plane_cases(data: Path, depth_m: float, count: int) -> Iterator[Case]:
-    """Textured planes at one distance, refocused with the reference camera."""
+    """Textured planes at one distance, refocused with the reference camera; a bare wall is no textured plane."""
     for folder in ("rgbd", "tabletop"):
-        for photo in _spread(data / folder, (count + 1) // 2):
-            texture = _sharp_texture(photo)
+        sharp = [(photo, _sharp_texture(photo)) for photo in load_photos(data / folder)]
+        textured = [(photo, texture) for photo, texture in sharp if _is_textured(texture)]
+        for photo, texture in textured[:: max(1, len(textured) // max(1, count // 2))][: count // 2]:
             plane = np.full(texture.shape[:2], depth_m, np.float32)
             picture = _to_pixels(refocus(texture, plane, REFERENCE))
             yield Case(f"{photo.name} at {depth_m} m", picture, plane, REFERENCE, "near")

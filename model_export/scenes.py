@@ -19,6 +19,7 @@ from service.optics import thin_lens
 
 SIDES = ("near", "far", "both")
 SIDE_SHARES = (0.45, 0.2, 0.35)
+K_CAM_LEAN = 0.6  # cameras with little blur need fewer examples than those with much
 Map = NDArray[np.float32]
 
 
@@ -43,8 +44,10 @@ class Sample:
     shot: Shot
 
 
-def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
-    return math.exp(rng.uniform(math.log(bounds[0]), math.log(bounds[1])))
+def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float], lean: float = 1.0) -> float:
+    """Between the bounds, uniform in the logarithm; a ``lean`` below 1 leans to the upper one."""
+    low, high = math.log(bounds[0]), math.log(bounds[1])
+    return math.exp(low + (high - low) * rng.random() ** lean)
 
 
 def draw_shot(rng: np.random.Generator, config: SceneConfig) -> Shot:
@@ -53,7 +56,7 @@ def draw_shot(rng: np.random.Generator, config: SceneConfig) -> Shot:
     disc_share = 0.0 if shape < 0.25 else 1.0 if shape > 0.65 else rng.uniform(0.3, 1.0)
     side = rng.choice(3, p=SIDE_SHARES)
     return Shot(
-        k_cam_px=_log_uniform(rng, config.k_cam_px),
+        k_cam_px=_log_uniform(rng, config.k_cam_px, K_CAM_LEAN),
         gamma_px=rng.uniform(*config.gamma_px),
         focus_distance_m=_log_uniform(rng, config.focus_distance_m),
         focal_length_px=_log_uniform(rng, config.focal_length_px),
@@ -150,12 +153,12 @@ def draw_layers(
 def develop(rng: np.random.Generator, linear: Map, config: SceneConfig) -> NDArray[np.uint8]:
     """Light on the sensor [h,w,3] to a JPEG's pixels: exposure, noise, white balance, tone, sharpening, JPEG."""
     picture = linear * rng.uniform(0.5, 1.4) / max(float(np.quantile(linear, 0.98)), 0.2)
-    shot_noise, read_noise = _log_uniform(rng, (1e-4, 1e-2)), _log_uniform(rng, (3e-4, 8e-3))
+    shot_noise, read_noise = _log_uniform(rng, (1e-6, 3e-4)), _log_uniform(rng, (1e-4, 2e-3))
     noise = rng.standard_normal(picture.shape).astype(np.float32)
     spread = rng.uniform(0, 0.9)
     if spread > 0.3:  # a demosaic makes noise of neighbours alike
         noise = np.asarray(cv2.GaussianBlur(noise, (0, 0), spread)) * np.float32(1 + 1.5 * spread)
-    picture = picture + noise * np.sqrt(shot_noise * np.maximum(picture, 0) * 0.1 + read_noise**2)
+    picture = picture + noise * np.sqrt(shot_noise * np.maximum(picture, 0) + read_noise**2)
     picture = picture * rng.uniform(0.85, 1.15, 3)
     encoded = encode_srgb(picture.astype(np.float32))
     bend = rng.uniform(-0.1, 0.35)

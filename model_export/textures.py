@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 OVERSAMPLE = 2
 KINDS = ("photo", "leaves", "noise", "drawing")
 KIND_SHARES = (0.57, 0.2, 0.08, 0.15)
-FADED_SHARE = 0.5
+FADED_SHARE = 0.35
 LETTERS = "ABCDEFGHJKLMNPRSTUVXYZabcdefghkmnoprstuvxyz0123456789&%#?"
 
 Image = NDArray[np.float32]
