@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 OVERSAMPLE = 2
 KINDS = ("photo", "leaves", "noise", "drawing")
-KIND_SHARES = (0.57, 0.2, 0.08, 0.15)
-FADED_SHARE = 0.35
+KIND_SHARES = (0.52, 0.28, 0.05, 0.15)
+FADED_SHARE = 0.45
+SHADED_SHARE = 0.5
 LETTERS = "ABCDEFGHJKLMNPRSTUVXYZabcdefghkmnoprstuvxyz0123456789&%#?"
 
 Image = NDArray[np.float32]
@@ -42,6 +43,8 @@ def draw_texture(rng: np.random.Generator, photographs: list[NDArray[np.uint8]],
         texture = _noise(rng, size)
     if rng.random() < FADED_SHARE:
         texture = _faded(rng, texture)
+    if rng.random() < SHADED_SHARE:
+        texture = _shaded(rng, texture)
     return _recolor(rng, texture)
 
 
@@ -51,10 +54,10 @@ def _shrink(image: NDArray[np.uint8], size: int) -> Image:
 
 
 def _photo(rng: np.random.Generator, photograph: NDArray[np.uint8], size: int) -> Image:
-    """A photograph turned, stretched and mirrored over the canvas, made at least twice as small as it was."""
+    """A photograph turned, stretched and mirrored over the canvas, made smaller than it was."""
     height, width = photograph.shape[:2]
     canvas = size * OVERSAMPLE
-    zoom = OVERSAMPLE * rng.uniform(0.22, 0.5)
+    zoom = OVERSAMPLE * rng.uniform(0.22, 0.7)
     if zoom < 0.75:
         photograph = np.asarray(cv2.resize(photograph, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA), np.uint8)
         height, width = photograph.shape[:2]
@@ -142,6 +145,20 @@ def _faded(rng: np.random.Generator, texture: Image) -> Image:
         strength = (faint + (1 - faint) / (1 + np.exp(-edge)))[..., None].astype(np.float32)
     ground = texture.mean((0, 1)) * (1 + 0.1 * _smooth_field(rng, size)[..., None])
     return np.asarray(np.clip(ground + (texture - ground) * strength, 0, 1), np.float32)
+
+
+def _shaded(rng: np.random.Generator, texture: Image) -> Image:
+    """The texture under soft shadows and lights: what is soft in a sharp picture, and must not pass for blur."""
+    size = texture.shape[0]
+    light = np.ones((size, size), np.float32)
+    for _ in range(int(rng.integers(1, 5))):
+        corners = rng.uniform(-0.3, 1.3, (4, 1, 2)) * size
+        mask = np.zeros((size, size), np.uint8)
+        cv2.fillConvexPoly(mask, cv2.convexHull(corners.astype(np.int32)), 255)
+        softness = float(np.exp(rng.uniform(np.log(3), np.log(40))))
+        soft = np.asarray(cv2.GaussianBlur(mask, (0, 0), softness), np.float32) / np.float32(255)
+        light *= 1 - np.float32(rng.uniform(-0.4, 0.6)) * soft
+    return np.asarray(np.clip(texture * light[..., None], 0, 1), np.float32)
 
 
 def _recolor(rng: np.random.Generator, texture: Image) -> Image:
