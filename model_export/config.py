@@ -29,7 +29,7 @@ class TrainConfig:
 
     kind: Kind = "compact"
     seed: int = 1
-    steps: int = 7_700
+    steps: int = 6_950
     batch: int = 12
     learning_rate: float = 1e-3
     weight_decay: float = 1e-4
@@ -38,8 +38,8 @@ class TrainConfig:
     clip_norm: float = 1.0
     b_weight: float = 1.0
     side_weight: float = 0.1
-    pool: int = 800
-    fresh_per_step: int = 4
+    pool: int = 700
+    fresh_per_step: int = 2
     checkpoint_every: int = 250
     settle_batches: int = 60
     scenes: SceneConfig = field(default_factory=SceneConfig)
