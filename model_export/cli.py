@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 if TYPE_CHECKING:  # importing torch takes seconds; a command that needs it does so itself
     from model_export.evaluate import Report
@@ -129,7 +129,7 @@ def evaluate(
 def _tables(report: "Report") -> list[Table]:
     tables = []
     for title, (head, rows) in report.tables().items():
-        table = Table(*head, title=title)
+        table = Table(Column(head[0], no_wrap=True), *head[1:], title=title)
         for row in rows:
             table.add_row(*row)
         tables.append(table)
