@@ -97,7 +97,7 @@ def _sharp_texture(photo: Photo) -> Map:
     return np.asarray(tiled, np.float32) / np.float32(255)
 
 
-def _is_textured(texture: Map) -> bool:
+def is_textured(texture: Map) -> bool:
     """Whether most cells of 32 px have a contrast (standard deviation of brightness) above 3 %."""
     height, width = (size // CELL_PX * CELL_PX for size in texture.shape[:2])
     grey = texture[:height, :width].mean(2)
@@ -109,7 +109,7 @@ def plane_cases(data: Path, depth_m: float, count: int) -> Iterator[Case]:
     """Textured planes at one distance, refocused with the reference camera; a bare wall is no textured plane."""
     for folder in ("rgbd", "tabletop"):
         sharp = [(photo, _sharp_texture(photo)) for photo in load_photos(data / folder)]
-        textured = [(photo, texture) for photo, texture in sharp if _is_textured(texture)]
+        textured = [(photo, texture) for photo, texture in sharp if is_textured(texture)]
         for photo, texture in textured[:: max(1, len(textured) // max(1, count // 2))][: count // 2]:
             plane = np.full(texture.shape[:2], depth_m, np.float32)
             picture = _to_pixels(refocus(texture, plane, REFERENCE))
