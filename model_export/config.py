@@ -11,7 +11,7 @@ Kind = Literal["compact", "paper"]
 class SceneConfig:
     """What the procedural scenes span. Ranges are (low, high); the manifest states them to the service."""
 
-    size_px: int = 160
+    size_px: int = 192
     margin_px: int = 32
     k_cam_px: tuple[float, float] = (0.5, 30.0)
     gamma_px: tuple[float, float] = (0.3, 1.6)
@@ -30,7 +30,7 @@ class TrainConfig:
     kind: Kind = "compact"
     seed: int = 1
     steps: int = 6_950
-    batch: int = 12
+    batch: int = 8
     learning_rate: float = 1e-3
     weight_decay: float = 1e-4
     warmup_steps: int = 200
@@ -38,8 +38,8 @@ class TrainConfig:
     clip_norm: float = 1.0
     b_weight: float = 1.0
     side_weight: float = 0.1
-    pool: int = 700
-    fresh_per_step: int = 2
+    pool: int = 600
+    fresh_per_step: int = 1
     checkpoint_every: int = 250
     settle_batches: int = 60
     scenes: SceneConfig = field(default_factory=SceneConfig)

@@ -135,8 +135,24 @@ def conv_block(inputs: int, outputs: int, convolutions: int = 2) -> nn.Sequentia
     return nn.Sequential(*layers)
 
 
+class Surroundings(nn.Module):
+    """A residual 3x3 convolution with holes, which starts as the identity: a far look at little cost."""
+
+    def __init__(self, width: int, dilation: int) -> None:
+        super().__init__()
+        self.convolution = nn.Conv2d(width, width, 3, padding=dilation, dilation=dilation, bias=False)
+        self.norm = nn.BatchNorm2d(width)
+        nn.init.zeros_(self.norm.weight)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return functional.relu(x + self.norm(self.convolution(x)))
+
+
 class UNet(nn.Module):
-    """Encoder and decoder with skips; ``joined`` are widths of maps added to the decoder's skips, finest first."""
+    """Encoder and decoder with skips; ``joined`` are widths of maps added to the decoder's skips, finest first.
+
+    ``dilations`` are those of the residual convolutions at the coarsest level.
+    """
 
     def __init__(
         self,
@@ -144,8 +160,10 @@ class UNet(nn.Module):
         widths: tuple[int, ...],
         joined: tuple[int, ...] = (),
         decoder_convolutions: int = 2,
+        dilations: tuple[int, ...] = (),
     ) -> None:
         super().__init__()
+        self.surroundings = nn.Sequential(*(Surroundings(widths[-1], d) for d in dilations))
         self.encoder = nn.ModuleList(conv_block(a, b) for a, b in zip((inputs, *widths), widths, strict=False))
         extra = joined or (0,) * (len(widths) - 1)
         self.decoder = nn.ModuleList(
@@ -159,6 +177,7 @@ class UNet(nn.Module):
         for i, block in enumerate(self.encoder):
             x = block(x if i == 0 else functional.max_pool2d(x, 2))
             skips.append(x)
+        x = self.surroundings(x)
         for i in reversed(range(len(self.decoder))):
             up = functional.interpolate(x, scale_factor=2.0, mode="nearest")
             x = self.decoder[i](torch.cat([up, skips[i], *joined[i : i + 1]], 1))
@@ -183,12 +202,13 @@ class CompactBlur(nn.Module):
     """Ours: pixels and band energies at half size into a small U-Net; hands its last features on."""
 
     WIDTHS = (24, 40, 64, 96)
+    DILATIONS = (2, 4)
 
     def __init__(self) -> None:
         super().__init__()
         self.front = BandEnergy()
         inputs = 12 + BandEnergy.OCTAVES * BandEnergy.BANDS
-        self.unet = UNet(inputs, self.WIDTHS)
+        self.unet = UNet(inputs, self.WIDTHS, dilations=self.DILATIONS)
         self.head = nn.Conv2d(self.WIDTHS[0], 2, 1)
         nn.init.constant_(self.head.bias[0:1], math.log(2.0))  # type: ignore[index]
 
@@ -210,11 +230,12 @@ class CompactDepth(nn.Module):
     """
 
     WIDTHS = (16, 24, 32, 48)
+    DILATIONS = (2, 4)
     INPUTS = 8
 
     def __init__(self) -> None:
         super().__init__()
-        self.unet = UNet(CompactBlur.WIDTHS[0] + self.INPUTS, self.WIDTHS)
+        self.unet = UNet(CompactBlur.WIDTHS[0] + self.INPUTS, self.WIDTHS, dilations=self.DILATIONS)
         self.head = nn.Conv2d(self.WIDTHS[0], 5, 1)
         with torch.no_grad():
             self.head.weight.mul_(0.1)

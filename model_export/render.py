@@ -113,15 +113,22 @@ def composite(layers: Iterable[tuple[Tensor, Tensor]]) -> Tensor:
     return image / (1 - clear).clamp_min(1e-3)
 
 
-def render_layers(layers: list[Layer], disc_share: float) -> Tensor:
-    """Linear picture [3,h,w] of layers given nearest first; the last one is opaque."""
+def render_layers(layers: list[Layer], disc_share: float) -> tuple[Tensor, Tensor]:
+    """Linear picture [3,h,w] of layers given nearest first, the last one opaque, and each pixel's layer [h,w].
+
+    A pixel belongs to the layer that most of its light comes from: a twig blurred over more than its width is
+    not what one sees there.
+    """
 
     def blurred(layer: Layer) -> tuple[Tensor, Tensor]:
         rgba = torch.cat([layer.color, layer.alpha])
         out = blur_varying(rgba, layer.defocus_px, disc_share)
         return out[:3], out[3:]
 
-    return composite(blurred(layer) for layer in layers)
+    parts = [blurred(layer) for layer in layers]
+    alpha = torch.cat([part for _, part in parts])
+    clear = torch.cat([torch.ones_like(alpha[:1]), torch.cumprod(1 - alpha, 0)[:-1]])
+    return composite(parts), (clear * alpha).argmax(0)
 
 
 def decode_srgb(encoded: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -19,6 +19,7 @@ from service.optics import thin_lens
 
 SIDES = ("near", "far", "both")
 SIDE_SHARES = (0.45, 0.2, 0.35)
+LAYERED_SHARE = 0.7
 K_CAM_LEAN = 0.6  # cameras with little blur need fewer examples than those with much
 Map = NDArray[np.float32]
 
@@ -74,12 +75,12 @@ def _excess_bounds(shot: Shot, config: SceneConfig) -> tuple[float, float]:
 
 
 def _draw_excess(rng: np.random.Generator, shot: Shot, config: SceneConfig) -> float:
-    """q - 1 of one surface: half the time uniform in blur, half log-uniform, on a side the shot has."""
+    """q - 1 of one surface: a third of the time uniform in blur, else log-uniform, on a side the shot has."""
     low, high = _excess_bounds(shot, config)
     far = shot.side > 0 or (shot.side == 0 and rng.random() < 0.5)
     end = -low if far else high
     first = min(config.defocus_px[0] / shot.k_cam_px, end / 2)
-    amount = rng.uniform(0, end) if rng.random() < 0.5 else _log_uniform(rng, (first, end))
+    amount = rng.uniform(0, end) if rng.random() < 1 / 3 else _log_uniform(rng, (first, end))
     return -amount if far else amount
 
 
@@ -125,17 +126,15 @@ def _outline(rng: np.random.Generator, size: int) -> Map:
 def draw_layers(
     rng: np.random.Generator, shot: Shot, config: SceneConfig, photographs: list[NDArray[np.uint8]]
 ) -> tuple[list[Layer], Map]:
-    """The scene's surfaces, nearest first, and q - 1 of what is seen at each pixel of the canvas."""
+    """The scene's surfaces, nearest first, and q - 1 of each over the canvas [layers,h,w]."""
     size = config.size_px + 2 * config.margin_px
     bounds = _excess_bounds(shot, config)
-    count = int(rng.integers(1, config.max_layers + 1)) if rng.random() < 0.8 else 1
+    count = int(rng.integers(1, config.max_layers + 1)) if rng.random() < LAYERED_SHARE else 1
     middles = sorted((_draw_excess(rng, shot, config) for _ in range(count)), reverse=True)
     layers: list[Layer] = []
-    seen = np.zeros((size, size), np.float32)
-    covered = np.zeros((size, size), np.bool_)
-    for i, middle in enumerate(middles):
+    excesses = np.stack([_surface(rng, middle, bounds, size) for middle in middles])
+    for i, excess in enumerate(excesses):
         alpha = np.ones((size, size), np.float32) if i == count - 1 else _outline(rng, size)
-        excess = _surface(rng, middle, bounds, size)
         color = decode_srgb(draw_texture(rng, photographs, size)) * alpha[..., None]
         layers.append(
             Layer(
@@ -144,10 +143,7 @@ def draw_layers(
                 torch.from_numpy(np.abs(excess) * np.float32(shot.k_cam_px)),
             )
         )
-        shows = (alpha > 0.5) & ~covered
-        seen[shows] = excess[shows]
-        covered |= shows
-    return layers, seen
+    return layers, excesses
 
 
 def develop(rng: np.random.Generator, linear: Map, config: SceneConfig) -> NDArray[np.uint8]:
@@ -178,8 +174,9 @@ def draw_sample(seed: int, config: SceneConfig, photographs: list[NDArray[np.uin
     """The scene of this seed: the same seed, config and photographs give the same sample."""
     rng = np.random.default_rng(seed)
     shot = draw_shot(rng, config)
-    layers, seen = draw_layers(rng, shot, config, photographs)
-    linear = render_layers(layers, shot.disc_share)
+    layers, excesses = draw_layers(rng, shot, config, photographs)
+    linear, front = render_layers(layers, shot.disc_share)
+    seen = np.take_along_axis(excesses, front.numpy()[None], 0)[0]
     rest = math.sqrt(max(shot.gamma_px**2 - PIXEL_BOX_VARIANCE, 0.0))
     linear = blur(linear, rest)
     inner = slice(config.margin_px, config.margin_px + config.size_px)

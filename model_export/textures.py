@@ -1,4 +1,4 @@
-"""Sharp textures for scenes: photographs, dead leaves, noise of random slope, text and lines.
+"""Sharp textures for scenes: photographs, dead leaves, plain objects, noise of random slope, text and lines.
 
 Every texture is drawn at twice the size it is wanted and reduced by area, so it is as sharp as pixels allow:
 what blur a scene shows is then the renderer's alone.
@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 OVERSAMPLE = 2
-KINDS = ("photo", "leaves", "noise", "drawing")
-KIND_SHARES = (0.52, 0.28, 0.05, 0.15)
+KINDS = ("photo", "leaves", "objects", "noise", "drawing")
+KIND_SHARES = (0.42, 0.18, 0.23, 0.05, 0.12)
 FADED_SHARE = 0.45
 SHADED_SHARE = 0.5
 LETTERS = "ABCDEFGHJKLMNPRSTUVXYZabcdefghkmnoprstuvxyz0123456789&%#?"
@@ -37,6 +37,8 @@ def draw_texture(rng: np.random.Generator, photographs: list[NDArray[np.uint8]],
         texture = _photo(rng, photographs[rng.integers(len(photographs))], size)
     elif kind == "leaves":
         texture = _leaves(rng, size)
+    elif kind == "objects":
+        texture = _objects(rng, size)
     elif kind == "drawing":
         texture = _drawing(rng, size)
     else:
@@ -49,6 +51,7 @@ def draw_texture(rng: np.random.Generator, photographs: list[NDArray[np.uint8]],
 
 
 def _shrink(image: NDArray[np.uint8], size: int) -> Image:
+    """The canvas [span, span(, 3)] at its final size, 0..1."""
     small = cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA)
     return np.asarray(small, np.float32) / np.float32(255)
 
@@ -57,7 +60,7 @@ def _photo(rng: np.random.Generator, photograph: NDArray[np.uint8], size: int) -
     """A photograph turned, stretched and mirrored over the canvas, made smaller than it was."""
     height, width = photograph.shape[:2]
     canvas = size * OVERSAMPLE
-    zoom = OVERSAMPLE * rng.uniform(0.22, 0.7)
+    zoom = OVERSAMPLE * rng.uniform(0.22, 0.8)
     if zoom < 0.75:
         photograph = np.asarray(cv2.resize(photograph, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA), np.uint8)
         height, width = photograph.shape[:2]
@@ -90,6 +93,55 @@ def _leaves(rng: np.random.Generator, size: int) -> Image:
         corners = center + radius * np.stack([np.cos(angles), np.sin(angles)], 1)
         cv2.fillPoly(canvas, [corners.astype(np.int32)], _shade(rng))
     return _shrink(canvas, size)
+
+
+def _paint(rng: np.random.Generator) -> Image:
+    """A colour [3] as rooms have them: any brightness, mostly little saturation."""
+    grey, saturation = rng.uniform(0.03, 1), rng.beta(0.7, 2)
+    return np.asarray(grey * (1 + saturation * (rng.uniform(0, 1, 3) - 0.7)), np.float32)
+
+
+def _slope(rng: np.random.Generator, size: int) -> Image:
+    """Soft light over a surface [size, size, 1], from even to strongly curved."""
+    strength = np.float32(rng.choice([0.0, 0.1, 0.3, 0.6]))
+    return 1 + strength * _smooth_field(rng, size)[..., None] / 2
+
+
+def _shape(rng: np.random.Generator, span: int) -> NDArray[np.uint8]:
+    """The mask [span, span] of a box, a rounded or a tapered thing, small to most of the canvas."""
+    mask = np.zeros((span, span), np.uint8)
+    center, turn = rng.uniform(0, span, 2), rng.uniform(0, 180)
+    longer = span * np.exp(rng.uniform(np.log(0.02), np.log(0.6)))
+    shorter = longer * rng.uniform(0.15, 1)
+    middle = (float(center[0]), float(center[1]))
+    kind = rng.integers(3)
+    if kind == 0:
+        cv2.ellipse(mask, (middle, (float(shorter), float(longer)), turn), 255, -1)
+        return mask
+    corners = cv2.boxPoints((middle, (float(shorter), float(longer)), turn))
+    if kind == 2:
+        corners = corners + rng.normal(0, 0.15 * shorter, corners.shape)
+    cv2.fillConvexPoly(mask, cv2.convexHull(np.asarray(corners, np.int32)), 255)
+    return mask
+
+
+def _objects(rng: np.random.Generator, size: int) -> Image:
+    """Plain things on a plain ground, softly lit, with soft shadows: sharp edges far between, as in a room."""
+    out = _paint(rng) * _slope(rng, size)
+    for _ in range(int(np.exp(rng.uniform(np.log(2), np.log(40))))):
+        mask = _shape(rng, size * OVERSAMPLE)
+        cover = _shrink(mask, size)
+        if rng.random() < 0.5:
+            shift = rng.normal(0, 6, 2)
+            softness = float(np.exp(rng.uniform(np.log(1.5), np.log(20))))
+            moved = np.array([[1, 0, shift[0]], [0, 1, shift[1]]])
+            shadow = cv2.GaussianBlur(cv2.warpAffine(cover, moved, (size, size)), (0, 0), softness)
+            out = out * (1 - np.float32(rng.uniform(0.1, 0.7)) * np.asarray(shadow)[..., None])
+        out = out + cover[..., None] * (_paint(rng) * _slope(rng, size) - out)
+    if rng.random() < 0.5:
+        grain = cv2.GaussianBlur(rng.standard_normal((size, size)).astype(np.float32), (0, 0), rng.uniform(0.5, 2))
+        out = out * (1 + np.float32(rng.uniform(0, 0.12)) * np.asarray(grain)[..., None])
+    return np.asarray(np.clip(out, 0, 1), np.float32)
 
 
 def _noise(rng: np.random.Generator, size: int) -> Image:

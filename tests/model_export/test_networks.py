@@ -5,7 +5,7 @@ import torch
 
 from model_export.config import Kind, TrainConfig
 from model_export.losses import Batch, correct, run_pair, total_loss
-from model_export.networks import BandEnergy, make_pair, parameter_count
+from model_export.networks import BandEnergy, Surroundings, make_pair, parameter_count
 from model_export.render import blur
 
 KINDS: list[Kind] = ["compact", "paper"]
@@ -34,7 +34,12 @@ def test_the_papers_pair_has_its_size() -> None:
 
 
 def test_ours_is_compact() -> None:
-    assert parameter_count(make_pair("compact")) < 0.7e6
+    assert parameter_count(make_pair("compact")) < 0.8e6
+
+
+def test_a_far_look_starts_as_no_look() -> None:
+    x = torch.rand(1, 8, 16, 16)
+    torch.testing.assert_close(Surroundings(8, 4)(x), x)
 
 
 def test_ours_keeps_each_hypothesis_on_its_side_of_focus() -> None:

@@ -119,7 +119,21 @@ def test_a_scene_of_one_shade_stays_that_shade_through_all_its_layers() -> None:
     near = torch.full((size, size), 5.0)
     layers = [Layer(shade * alpha.repeat(3, 1, 1), alpha, near)]
     layers.append(Layer(torch.full((3, size, size), shade), torch.ones(1, size, size), far))
-    np.testing.assert_allclose(render_layers(layers, 1.0).numpy(), shade, atol=1e-4)
+    picture, _ = render_layers(layers, 1.0)
+    np.testing.assert_allclose(picture.numpy(), shade, atol=1e-4)
+
+
+def test_a_pixel_belongs_to_the_layer_most_of_its_light_is_from() -> None:
+    """A bar two sigma wide hides what is behind it; the same bar blurred eight times as much hides nothing."""
+    size = 96
+    alpha = torch.zeros(1, size, size)
+    alpha[:, :, 44:52] = 1
+    behind = Layer(torch.zeros(3, size, size), torch.ones(1, size, size), torch.full((size, size), 0.5))
+    for blur_px, shown in ((1.0, True), (16.0, False)):
+        bar = Layer(alpha.repeat(3, 1, 1), alpha, torch.full((size, size), blur_px))
+        _, front = render_layers([bar, behind], 0.0)
+        assert (front[:, 46:50] == (0 if shown else 1)).all()
+        assert (front[:, :36] == 1).all()
 
 
 def test_nothing_to_render_is_an_error() -> None:
