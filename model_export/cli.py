@@ -1,6 +1,5 @@
-"""What training adds to the command ``camind``: train, export, verify, evaluate."""
+"""What training adds to the command ``camind``: train, export, verify, evaluate, blender."""
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,8 +9,9 @@ import typer
 from rich.console import Console
 from rich.table import Column, Table
 
+from model_export.progress import progress_bar
+
 if TYPE_CHECKING:  # importing torch takes seconds; a command that needs it does so itself
-    from model_export.evaluate import Report
     from model_export.verify import Difference
 
 commands = typer.Typer(help="Train, export and score models.")
@@ -21,6 +21,8 @@ Model = Annotated[Path, typer.Option(help="model folder", file_okay=False)]
 Textures = Annotated[Path, typer.Option(help="folder of pictures with LICENCES.md", exists=True, file_okay=False)]
 Checkpoint = Annotated[Path, typer.Option(help="checkpoint file of a run", exists=True, dir_okay=False)]
 
+BLENDER_ENVIRONMENT = Path(".venv-blender")
+FILE_COLUMNS = 160
 DEFAULT_MODEL = Path(__file__).parents[1] / "service" / "models"
 
 
@@ -101,42 +103,65 @@ def _differences(differences: "list[Difference]") -> Table:
 @commands.command()
 def evaluate(
     data: Annotated[
-        Path, typer.Option(help="folder with rgbd/, tabletop/, d200/ (what is there is used)", exists=True)
+        Path, typer.Option(help="folder with rgbd/, tabletop/, d200/, blender/ (what is there is used)", exists=True)
     ],
     model: Model = DEFAULT_MODEL,
     quick: Annotated[bool, typer.Option(help="a few pictures of each set")] = False,
-    out: Annotated[Path | None, typer.Option(help="folder for report.json and sample maps")] = None,
+    out: Annotated[Path | None, typer.Option(help="folder for report.html, report.json and their pictures")] = None,
     update_card: Annotated[bool, typer.Option(help="write the scores into the model's card and manifest")] = False,
 ) -> None:
     """Score a model on pictures that no training saw, beside the best constant depth of each picture."""
     with _training_parts():
+        from model_export import report as reports
         from model_export.evaluate import evaluate as run_evaluation
 
     console = Console(stderr=True)
     with console.status("loading") as status:
         report = run_evaluation(model, data, quick=quick, on_progress=status.update)
     stdout = Console()
-    for table in _tables(report):
-        stdout.print(table)
-    if out is not None:
-        _write_report(report, out)
-    if update_card:
-        from model_export.card import record_scores
-
-        record_scores(model, report.scores(), report.markdown(), "camind evaluate --data DATA")
-
-
-def _tables(report: "Report") -> list[Table]:
-    tables = []
-    for title, (head, rows) in report.tables().items():
+    if not stdout.is_terminal:
+        stdout.width = FILE_COLUMNS
+    for title, (head, rows) in reports.tables(report).items():
         table = Table(Column(head[0], no_wrap=True), *head[1:], title=title)
         for row in rows:
             table.add_row(*row)
-        tables.append(table)
-    return tables
+        stdout.print(table)
+    if out is not None:
+        reports.write(report, out)
+        typer.echo(out / "report.html")
+    if update_card:
+        from model_export.card import record_scores
+
+        record_scores(model, report.scores(), reports.markdown(report), "camind evaluate --data DATA")
 
 
-def _write_report(report: "Report", out: Path) -> None:
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "report.json").write_text(json.dumps(report.as_dict(), indent=2) + "\n")
-    report.write_samples(out)
+@commands.command()
+def blender(
+    out: Annotated[Path, typer.Option(help="folder of the set, e.g. DATA/blender", file_okay=False)],
+    scenes: Annotated[int, typer.Option(min=1, max=1000, help="rooms to render")] = 200,
+    environment: Annotated[Path, typer.Option(help="Blender's own environment, made if missing")] = BLENDER_ENVIRONMENT,
+) -> None:
+    """Ray-trace thin-lens scenes with exact depth, and compare our renderer's edges with Cycles'."""
+    with _training_parts():
+        from model_export.datasets import blender as cycles
+
+    edges, rooms = cycles.edges(), cycles.rooms(scenes)
+    raw = out / "raw"
+    try:
+        with progress_bar(Console(stderr=True)) as progress:
+            task = progress.add_task("Blender", total=None)
+            python = cycles.environment(environment)
+            progress.update(task, description="rendering", total=len(edges) + len(rooms))
+            cycles.render(python, [*edges, *rooms], raw, lambda _: progress.advance(task))
+    except (FileNotFoundError, RuntimeError) as exc:
+        raise _fail(str(exc)) from exc
+    cycles.develop(raw, rooms, out)
+    table = Table("edge", "sigma px", "Cycles", "ours", "ours / Cycles")
+    worst = 0.0
+    for result in cycles.compare_edges(raw, edges):
+        ratio = result.ours_px / result.cycles_px
+        worst = max(worst, abs(ratio - 1))
+        table.add_row(result.name, *(f"{v:.3f}" for v in (result.expected_px, result.cycles_px, result.ours_px, ratio)))
+    Console().print(table)
+    if worst > cycles.EDGE_TOLERANCE:
+        raise _fail(f"ours and Cycles differ by {worst:.1%}, more than {cycles.EDGE_TOLERANCE:.0%}")

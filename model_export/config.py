@@ -25,7 +25,10 @@ class SceneConfig:
 
 @dataclass(frozen=True, slots=True)
 class TrainConfig:
-    """A training run: ``steps`` batches, drawn from a pool that ``fresh_per_step`` new scenes flow through."""
+    """A training run: ``steps`` batches, drawn from a pool that ``fresh_per_step`` new scenes flow through.
+
+    The last ``settled_share`` of the steps has the batch norms' statistics fixed, as the exported network has.
+    """
 
     kind: Kind = "compact"
     seed: int = 1
@@ -41,6 +44,7 @@ class TrainConfig:
     pool: int = 600
     fresh_per_step: int = 1
     checkpoint_every: int = 250
+    settled_share: float = 0.35
     settle_batches: int = 60
     scenes: SceneConfig = field(default_factory=SceneConfig)
 

@@ -4,228 +4,124 @@ Every picture goes through the estimator that answers requests, so a figure here
 without an answer is scored with the median of the picture's answers, and the share of answers is reported.
 """
 
-import itertools
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from model_export.config import SceneConfig
-from model_export.datasets.photos import Photo, filled, load_photos
-from model_export.metrics import Scores, best_constant, completed, mean_scores, score
-from model_export.render import encode_srgb, refocus
-from model_export.scenes import draw_sample, true_blur_px
-from model_export.train import HELD_OUT_SEED
+from model_export.cases import UNSEEN_K_CAM_PX, Case, trials
+from model_export.metrics import Scores, best_constant, completed, mean_scores, pooled_scores, score
 from service.inference.artifact import load_model_folder
+from service.inference.cancellation import Cancellation
+from service.inference.depth_map import SIGMA_OF_LAPLACE
 from service.inference.estimator import Estimator
-from service.inference.pair import Side
-from service.optics.camera import Camera, Intrinsics, Lens
+from service.inference.pair import GraphPair, Stopwatch
+from service.optics.camera import Camera
 
-REFERENCE = Camera(640, 480, 2.0, 3.81, 0.5, intrinsics=Intrinsics(525.0, 525.0, 319.5, 239.5))
-PLANES_M = (0.7, 1.0, 1.5)
-NEAR_LIMIT_M = 2.0
-D200 = Lens(35.0, 2.8, 6.05, 3872)
-D200_LIMIT_M = 5.0
-D200_STEP = 0.05
-D200_STEP_MARGIN_PX = 25
-CELL_PX = 32
-CELL_CONTRAST = 0.03
-TEXTURED_SHARE = 0.6
-BLUR_BINS_PX = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, math.inf)
-PROCEDURAL_SCENES = 120
-SIDES: dict[int, Side] = {-1: "near", 0: "auto", 1: "far"}
+# an unknown camera is taken for the middle one of those that are scored
+UNKNOWN_K_CAM_PX = math.prod(UNSEEN_K_CAM_PX) ** (1 / len(UNSEEN_K_CAM_PX))
+MODES: dict[str, Callable[[float], float]] = {
+    "gt": lambda k_cam_px: k_cam_px,
+    "no k_cam": lambda _: UNKNOWN_K_CAM_PX,
+    "k_cam -10%": lambda k_cam_px: 0.9 * k_cam_px,
+    "k_cam +10%": lambda k_cam_px: 1.1 * k_cam_px,
+}
+BLUR_RANGES_PX = (
+    *((0.0, 0.5), (0.5, 1.0), (1.0, 2.0), (2.0, 4.0), (4.0, 8.0), (8.0, 16.0), (16.0, math.inf)),
+    *((0.6, 1.0), (1.0, 8.0)),
+)
+SAMPLED_PIXELS = 3000
 
 Map = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
-    """One picture to answer: truth is NaN where it is not scored."""
+class Pixels:
+    """Some pixels of a set, each map [n]: the error stated (a relative standard deviation) and the one made."""
 
-    name: str
-    image: NDArray[np.uint8]
-    truth_m: Map
-    camera: Camera
-    side: Side
+    truth: Map
+    answer: Map
+    stated: Map
+
+    @property
+    def error(self) -> Map:
+        """Relative error, signed."""
+        return self.answer / self.truth - 1
+
+    def certain(self, share: float = 0.5) -> NDArray[np.bool_]:
+        """The share of the pixels with the least stated error."""
+        return np.asarray(self.stated <= np.quantile(self.stated, share, method="lower"))
+
+    @staticmethod
+    def joined(parts: Sequence["Pixels"]) -> "Pixels":
+        return Pixels(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("truth", "answer", "stated")))
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
     """What one picture scored, what the best constant depth would have, and the share of scored pixels answered."""
 
-    name: str
     scores: Scores
     constant: Scores
+    scored_pixels: int
     answered: float
     median_error: float
-    depth_m: Map
-    truth_m: Map
+    depth: Pixels
+    blur: Pixels | None
 
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """A set's scores, pooled over pixels and averaged over pictures, beside the best constant of each picture."""
+    """A set's scores in one mode, beside the best constant depth of each picture.
+
+    ``certain_abs_rel`` is that of the half of the pixels with the least stated error; ``order`` is the mean error
+    of the most certain tenth over that of the least certain half.
+    """
 
     name: str
+    mode: str
     pictures: int
     answered: float
     pooled: Scores
     mean: Scores
-    constant: Scores
+    constant_pooled: Scores
+    constant_mean: Scores
     median_error: float
+    certain_abs_rel: float
+    order: float
+    depth: Pixels
 
     def as_dict(self) -> dict[str, object]:
-        parts = {"pooled": self.pooled, "mean": self.mean, "constant": self.constant}
-        numbers = {"pictures": self.pictures, "answered": self.answered, "median_error": self.median_error}
-        return {**numbers, **{name: scores.as_dict() for name, scores in parts.items()}}
-
-
-def _to_pixels(picture: Map) -> NDArray[np.uint8]:
-    return (picture * 255 + 0.5).astype(np.uint8)
-
-
-def _sharp_texture(photo: Photo) -> Map:
-    """A frame halved, so that its own softness is gone, and mirrored back to its size; sRGB 0..1."""
-    height, width = photo.image.shape[:2]
-    half = cv2.resize(photo.image, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
-    tiled = cv2.copyMakeBorder(half, 0, height - height // 2, 0, width - width // 2, cv2.BORDER_REFLECT)
-    return np.asarray(tiled, np.float32) / np.float32(255)
-
-
-def is_textured(texture: Map) -> bool:
-    """Whether most cells of 32 px have a contrast (standard deviation of brightness) above 3 %."""
-    height, width = (size // CELL_PX * CELL_PX for size in texture.shape[:2])
-    grey = texture[:height, :width].mean(2)
-    cells = grey.reshape(height // CELL_PX, CELL_PX, width // CELL_PX, CELL_PX).std((1, 3))
-    return float((cells > CELL_CONTRAST).mean()) >= TEXTURED_SHARE
-
-
-def plane_cases(data: Path, depth_m: float, count: int) -> Iterator[Case]:
-    """Textured planes at one distance, refocused with the reference camera; a bare wall is no textured plane."""
-    for folder in ("rgbd", "tabletop"):
-        sharp = [(photo, _sharp_texture(photo)) for photo in load_photos(data / folder)]
-        textured = [(photo, texture) for photo, texture in sharp if is_textured(texture)]
-        for photo, texture in textured[:: max(1, len(textured) // max(1, count // 2))][: count // 2]:
-            plane = np.full(texture.shape[:2], depth_m, np.float32)
-            picture = _to_pixels(refocus(texture, plane, REFERENCE))
-            yield Case(f"{photo.name} at {depth_m} m", picture, plane, REFERENCE, "near")
-
-
-def refocused_cases(folder: Path, count: int) -> Iterator[Case]:
-    """Sharp frames with depth, refocused with the reference camera; scored to 2 m."""
-    for photo in _spread(folder, count):
-        depth_m = filled(photo.depth_m)
-        encoded = photo.image.astype(np.float32) / np.float32(255)
-        picture = _to_pixels(refocus(encoded, depth_m, REFERENCE))
-        with np.errstate(invalid="ignore"):
-            truth = np.where(photo.depth_m <= NEAR_LIMIT_M, photo.depth_m, np.float32(np.nan))
-        if np.isfinite(truth).mean() > 0.05:
-            yield Case(photo.name, picture, truth.astype(np.float32), REFERENCE, "near")
-
-
-def d200_cases(folder: Path, count: int) -> Iterator[Case]:
-    """Real photographs of a real lens, known by its specs alone; scored away from depth steps and to 5 m."""
-    for photo in _spread(folder, count):
-        height, width = photo.image.shape[:2]
-        fx = D200.fx_px(width)
-        inner = Intrinsics(fx, fx, (width - 1) / 2, (height - 1) / 2)
-        camera = Camera(width, height, 2.0, D200.k_cam_px(2.0, width), 0.5, D200.focal_length_m, inner)
-        truth = photo.depth_m.copy()
-        truth[_near_steps(filled(truth)) | (filled(truth) > D200_LIMIT_M)] = np.nan
-        if np.isfinite(truth).mean() > 0.02:
-            yield Case(photo.name, photo.image, truth, camera, "auto")
-
-
-def _near_steps(depth_m: Map) -> NDArray[np.bool_]:
-    """Pixels within the margin of a step of more than 5 % between neighbours."""
-    kernel = np.ones((3, 3), np.uint8)
-    ratio = cv2.dilate(depth_m, kernel) / cv2.erode(depth_m, kernel)
-    step = (np.asarray(ratio) > 1 + D200_STEP).astype(np.uint8)
-    size = 2 * D200_STEP_MARGIN_PX + 1
-    return np.asarray(cv2.dilate(step, np.ones((size, size), np.uint8))) > 0
-
-
-def _spread(folder: Path, count: int) -> Iterator[Photo]:
-    """About ``count`` of a folder's photos, spread over it."""
-    total = len(list((folder / "color").glob("*")))
-    return load_photos(folder, max(1, math.ceil(total / count)))
-
-
-def answer(estimator: Estimator, case: Case) -> Outcome:
-    """Run a case through the estimator and score it."""
-    depth_m = estimator.estimate(case.image, case.camera, case.side).depth_m
-    scored = np.isfinite(case.truth_m)
-    truth = case.truth_m[scored]
-    depth = completed(depth_m)[scored]
-    return Outcome(
-        name=case.name,
-        scores=score(depth, truth),
-        constant=score(np.full_like(truth, best_constant(truth)), truth),
-        answered=float(np.isfinite(depth_m[scored]).mean()),
-        median_error=float(abs(np.median(depth / truth) - 1)),
-        depth_m=depth_m,
-        truth_m=case.truth_m,
-    )
-
-
-def summarise(name: str, outcomes: list[Outcome]) -> Summary:
-    """A set's figures; raises ``ValueError`` for an empty set."""
-    if not outcomes:
-        raise ValueError(f"{name}: no picture to score")
-    kept = [np.isfinite(o.truth_m) for o in outcomes]
-    depth = np.concatenate([completed(o.depth_m)[k] for o, k in zip(outcomes, kept, strict=True)])
-    truth = np.concatenate([o.truth_m[k] for o, k in zip(outcomes, kept, strict=True)])
-    return Summary(
-        name=name,
-        pictures=len(outcomes),
-        answered=float(np.mean([o.answered for o in outcomes])),
-        pooled=score(depth, truth),
-        mean=mean_scores([o.scores for o in outcomes]),
-        constant=mean_scores([o.constant for o in outcomes]),
-        median_error=float(np.median([o.median_error for o in outcomes])),
-    )
+        plain = ("name", "mode", "pictures", "answered", "median_error", "certain_abs_rel", "order")
+        tables = ("pooled", "mean", "constant_pooled", "constant_mean")
+        return {n: getattr(self, n) for n in plain} | {n: getattr(self, n).as_dict() for n in tables}
 
 
 @dataclass(frozen=True, slots=True)
-class BlurBin:
-    """How blur is read where lambda lies in a range: median relative error, and its 90th percentile."""
+class BlurRange:
+    """How lambda is read where the truth lies in a range: medians of the relative error, and its sign's."""
 
+    name: str
     low_px: float
     high_px: float
     pixels: int
     median: float
+    certain_median: float
     p90: float
+    bias: float
 
 
-def procedural_blur(estimator: Estimator, count: int) -> list[BlurBin]:
-    """Error of lambda by range of lambda on procedural scenes of seeds and textures that no training drew."""
-    errors: list[Map] = []
-    truths: list[Map] = []
-    for number in range(count):
-        sample = draw_sample(HELD_OUT_SEED + number, SceneConfig(), [])
-        shot = sample.shot
-        height, width = sample.excess.shape
-        camera = Camera(width, height, shot.focus_distance_m, shot.k_cam_px, shot.gamma_px)
-        image = np.ascontiguousarray(sample.image.transpose(1, 2, 0))
-        blur_px = estimator.estimate(image, camera, SIDES[shot.side]).blur_px
-        truth = true_blur_px(sample)
-        errors.append((np.abs(blur_px - truth) / truth).ravel())
-        truths.append(truth.ravel())
-    return _bins(np.concatenate(errors), np.concatenate(truths))
+@dataclass(frozen=True, slots=True)
+class Example:
+    """One picture of a set for the eye."""
 
-
-def _bins(error: Map, truth: Map) -> list[BlurBin]:
-    bins = []
-    for low, high in itertools.pairwise(BLUR_BINS_PX):
-        part = error[(truth >= low) & (truth < high)]
-        if part.size:
-            bins.append(BlurBin(low, high, part.size, float(np.median(part)), float(np.quantile(part, 0.9))))
-    return bins
+    image: NDArray[np.uint8]
+    truth_m: Map
+    depth_m: Map
+    sigma_m: Map
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,104 +130,148 @@ class Report:
 
     model: str
     sets: list[Summary]
-    blur: list[BlurBin]
-    samples: dict[str, Outcome]
+    blur: list[BlurRange]
+    blur_pixels: dict[str, Pixels]
+    examples: dict[str, Example]
+
+    def summary(self, name: str, mode: str = "gt") -> Summary:
+        """Raises ``KeyError`` for a set that was not scored."""
+        for found in self.sets:
+            if (found.name, found.mode) == (name, mode):
+                return found
+        raise KeyError((name, mode))
 
     def as_dict(self) -> dict[str, object]:
-        bins = [
-            {
-                "low_px": b.low_px,
-                "high_px": b.high_px if math.isfinite(b.high_px) else None,
-                "pixels": b.pixels,
-                "median": b.median,
-                "p90": b.p90,
-            }
-            for b in self.blur
-        ]
-        return {"model": self.model, "sets": {s.name: s.as_dict() for s in self.sets}, "blur": bins}
-
-    def tables(self) -> dict[str, tuple[list[str], list[list[str]]]]:
-        """Title to head and rows, as text."""
-        depth_head = ["set", "pictures", "answered", "AbsRel", "best constant", "RMSE m", "delta1", "median error"]
-        depth_rows = [
-            [
-                s.name,
-                str(s.pictures),
-                f"{s.answered:.0%}",
-                f"{s.mean.abs_rel:.3f}",
-                f"{s.constant.abs_rel:.3f}",
-                f"{s.mean.rmse:.3f}",
-                f"{s.mean.delta1:.3f}",
-                f"{s.median_error:.1%}",
-            ]
-            for s in self.sets
-        ]
-        blur_head = ["lambda px", "pixels", "median error", "90th percentile"]
-        blur_rows = [
-            [f"{b.low_px:g}-{b.high_px:g}", f"{b.pixels:,}", f"{b.median:.1%}", f"{b.p90:.1%}"] for b in self.blur
-        ]
-        return {
-            "Depth, mean over pictures": (depth_head, depth_rows),
-            "Blur on procedural scenes": (blur_head, blur_rows),
-        }
-
-    def markdown(self) -> dict[str, str]:
-        """The same tables in Markdown, by title."""
-        return {title: _markdown([head, ["---"] * len(head), *rows]) for title, (head, rows) in self.tables().items()}
-
-    def write_samples(self, folder: Path) -> None:
-        """One picture a set: the truth beside the answer."""
-        for name, outcome in self.samples.items():
-            pair = np.hstack([preview(outcome.truth_m), preview(outcome.depth_m)])
-            cv2.imwrite(str(folder / f"{name}.png"), pair)
+        ranges = [asdict(b) | {"high_px": b.high_px if math.isfinite(b.high_px) else None} for b in self.blur]
+        return {"model": self.model, "sets": [s.as_dict() for s in self.sets], "blur": ranges}
 
     def scores(self) -> dict[str, float]:
-        """What the manifest keeps: AbsRel of every set, of its best constants, and the planes' median error."""
-        kept = {f"{s.name}.abs_rel": s.mean.abs_rel for s in self.sets}
-        kept |= {f"{s.name}.constant_abs_rel": s.constant.abs_rel for s in self.sets}
-        kept |= {f"{s.name}.median_error": s.median_error for s in self.sets if s.name.startswith("plane")}
+        """What the manifest keeps, by ``set.score``, in the mode where the camera is known."""
+        kept: dict[str, float] = {}
+        for s in self.sets:
+            if s.mode == "gt":
+                kept[f"{s.name}.abs_rel"] = s.mean.abs_rel
+                kept[f"{s.name}.constant_abs_rel"] = s.constant_mean.abs_rel
+                kept[f"{s.name}.rmse_m"] = s.pooled.rmse
+                kept[f"{s.name}.median_error"] = s.median_error
         return {name: round(value, 4) for name, value in kept.items()}
 
 
-def _markdown(rows: list[list[str]]) -> str:
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+class Examiner:
+    """A loaded model under examination."""
+
+    def __init__(self, model: Path) -> None:
+        folder = load_model_folder(model)
+        self.name = folder.manifest.name
+        self._pair = GraphPair(folder, intra_op_threads=2)
+        self._estimator = Estimator(self._pair)
+        self._stride = folder.manifest.stride
+
+    def answer(self, case: Case, mode: str = "gt") -> tuple[Outcome, Example]:
+        """Run a case through the estimator, with the camera as the mode tells it, and score the answer."""
+        camera = replace(case.camera, k_cam_px=MODES[mode](case.camera.k_cam_px))
+        told = self._estimator.estimate(case.image, camera, case.side)
+        scored = np.isfinite(case.truth_m)
+        truth, depth = case.truth_m[scored], completed(told.depth_m)[scored]
+        stated = np.nan_to_num(told.sigma_m / told.depth_m, nan=np.inf)[scored]
+        some = slice(None, None, max(1, truth.size // SAMPLED_PIXELS))
+        outcome = Outcome(
+            scores=score(depth, truth),
+            constant=score(np.full_like(truth, best_constant(truth)), truth),
+            scored_pixels=truth.size,
+            answered=float(np.isfinite(told.depth_m[scored]).mean()),
+            median_error=float(abs(np.median(depth / truth) - 1)),
+            depth=Pixels(truth[some], depth[some], stated[some]),
+            blur=self._blur(case, camera) if mode == "gt" else None,
+        )
+        return outcome, Example(case.image, case.truth_m, told.depth_m, told.sigma_m)
+
+    def _blur(self, case: Case, camera: Camera) -> Pixels | None:
+        """Lambda where the case knows it, at the cells of the blur graph, read at full size."""
+        if case.blur_px is None:
+            return None
+        maps = self._pair.read(case.image, camera, case.side, Cancellation(), Stopwatch())
+        truth = case.blur_px[:: self._stride, :: self._stride]
+        known = np.isfinite(truth)
+        stated = np.exp(maps["blur_log_error"]) * SIGMA_OF_LAPLACE
+        return Pixels(truth[known], maps["blur_px"][known], stated[known])
 
 
-def case_sets(data: Path, quick: bool) -> dict[str, Callable[[], Iterator[Case]]]:
-    """The sets that the data folder can serve, by name; a missing folder is a missing set, and said."""
-    few, many = (2, 4) if quick else (8, 40)
-    sets: dict[str, Callable[[], Iterator[Case]]] = {}
-    if (data / "rgbd").is_dir() and (data / "tabletop").is_dir():
-        for distance in PLANES_M:
-            sets[f"plane_{distance:g}m"] = partial(plane_cases, data, distance, few)
-    for name in ("rgbd", "tabletop"):
-        if (data / name).is_dir():
-            sets[name] = partial(refocused_cases, data / name, many)
-    if (data / "d200").is_dir():
-        sets["d200"] = partial(d200_cases, data / "d200", 2 * many)
-    return sets
+def summarise(name: str, mode: str, outcomes: Sequence[Outcome]) -> Summary:
+    """A set's figures; raises ``ValueError`` for an empty set."""
+    if not outcomes:
+        raise ValueError(f"{name}: no picture to score")
+    depth = Pixels.joined([o.depth for o in outcomes])
+    error = np.abs(depth.error)
+    least_certain = ~depth.certain(0.5)
+    weights = [o.scored_pixels for o in outcomes]
+    return Summary(
+        name=name,
+        mode=mode,
+        pictures=len(outcomes),
+        answered=float(np.mean([o.answered for o in outcomes])),
+        pooled=pooled_scores([o.scores for o in outcomes], weights),
+        mean=mean_scores([o.scores for o in outcomes]),
+        constant_pooled=pooled_scores([o.constant for o in outcomes], weights),
+        constant_mean=mean_scores([o.constant for o in outcomes]),
+        median_error=float(np.median([o.median_error for o in outcomes])),
+        certain_abs_rel=float(error[depth.certain(0.5)].mean()),
+        order=float(error[depth.certain(0.1)].mean() / error[least_certain].mean()) if least_certain.any() else 1.0,
+        depth=depth,
+    )
+
+
+def blur_ranges(name: str, pixels: Pixels) -> list[BlurRange]:
+    """Errors of lambda by range of the true lambda; ranges that no pixel shows are left out."""
+    found = []
+    for low, high in BLUR_RANGES_PX:
+        inside = (pixels.truth >= low) & (pixels.truth < high)
+        if not inside.any():
+            continue
+        part = Pixels(pixels.truth[inside], pixels.answer[inside], pixels.stated[inside])
+        error = np.abs(part.error)
+        found.append(
+            BlurRange(
+                name=name,
+                low_px=low,
+                high_px=high,
+                pixels=error.size,
+                median=float(np.median(error)),
+                certain_median=float(np.median(error[part.certain()])),
+                p90=float(np.quantile(error, 0.9)),
+                bias=float(np.median(part.error)),
+            )
+        )
+    return found
 
 
 def evaluate(
     model: Path, data: Path, *, quick: bool = False, on_progress: Callable[[str], None] = lambda _: None
 ) -> Report:
     """Score a model folder on everything below ``data`` and on procedural scenes."""
-    folder = load_model_folder(model)
-    estimator = Estimator.from_folder(folder, intra_op_threads=2)
-    summaries, samples = [], {}
-    for name, cases in case_sets(data, quick).items():
-        outcomes = []
-        for case in cases():
-            outcomes.append(answer(estimator, case))
-            on_progress(f"{name}: {case.name}")
-        summaries.append(summarise(name, outcomes))
-        samples[name] = outcomes[0]
-    on_progress("procedural scenes")
-    blur = procedural_blur(estimator, PROCEDURAL_SCENES // (6 if quick else 1))
-    return Report(folder.manifest.name, summaries, blur, samples)
-
-
-def preview(depth_m: Map) -> NDArray[np.uint8]:
-    """A depth map for the eye: near bright, 0.3 to 5 m by inverse depth, NaN black."""
-    bright = np.clip((1 / np.nan_to_num(depth_m, nan=np.inf) - 0.2) / (1 / 0.3 - 0.2), 0, 1)
-    return _to_pixels(encode_srgb(bright.astype(np.float32)))
+    examiner = Examiner(model)
+    outcomes: dict[tuple[str, str], list[Outcome]] = {}
+    examples: dict[str, Example] = {}
+    for trial in trials(data, quick):
+        for case in trial.cases():
+            for mode in trial.modes:
+                outcome, example = examiner.answer(case, mode)
+                outcomes.setdefault((trial.name, mode), []).append(outcome)
+                examples.setdefault(trial.name, example)
+            on_progress(f"{trial.name}: {case.name}")
+    for k_cam_px in UNSEEN_K_CAM_PX:
+        for mode in MODES:
+            both = [outcomes.get((f"{folder} k_cam {k_cam_px:g}", mode), []) for folder in ("rgbd", "tabletop")]
+            if all(both):
+                outcomes[f"indoor k_cam {k_cam_px:g}", mode] = [*both[0], *both[1]]
+    blur: dict[str, list[Pixels]] = {}
+    for (name, _), found in outcomes.items():
+        blur.setdefault(name.split()[0], []).extend(o.blur for o in found if o.blur is not None)
+    blur_pixels = {name: Pixels.joined(parts) for name, parts in blur.items() if parts}
+    return Report(
+        model=examiner.name,
+        sets=[summarise(name, mode, found) for (name, mode), found in outcomes.items()],
+        blur=[row for name, pixels in blur_pixels.items() for row in blur_ranges(name, pixels)],
+        blur_pixels=blur_pixels,
+        examples=examples,
+    )

@@ -104,7 +104,7 @@ def _paint(rng: np.random.Generator) -> Image:
 def _slope(rng: np.random.Generator, size: int) -> Image:
     """Soft light over a surface [size, size, 1], from even to strongly curved."""
     strength = np.float32(rng.choice([0.0, 0.1, 0.3, 0.6]))
-    return 1 + strength * _smooth_field(rng, size)[..., None] / 2
+    return np.asarray(1 + strength * _smooth_field(rng, size)[..., None] / 2, np.float32)
 
 
 def _shape(rng: np.random.Generator, span: int) -> NDArray[np.uint8]:

@@ -16,19 +16,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from torch.utils.data import DataLoader, Dataset
 
 from model_export.config import SceneConfig, TrainConfig
 from model_export.losses import Batch, run_pair, total_loss
 from model_export.networks import Pair, make_pair
+from model_export.progress import progress_bar
 from model_export.scenes import Sample, draw_sample
 from model_export.textures import load_photographs
 
@@ -169,6 +162,11 @@ def learning_rate(config: TrainConfig, step: int) -> float:
     return config.learning_rate * min(1.0, (step + 1) / config.warmup_steps, left)
 
 
+def settling_step(config: TrainConfig) -> int:
+    """The step before which the batch norms' statistics are settled for good."""
+    return round(config.steps * (1 - config.settled_share))
+
+
 def computes_bfloat16(device: torch.device) -> bool:
     """Whether the device multiplies bfloat16 itself."""
     return device.type != "cpu" or torch.cpu._is_avx512_bf16_supported()
@@ -201,6 +199,9 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(self.config, self.step)
         self.modules.train()
+        if self.step >= settling_step(self.config):
+            for norm in self._norms():
+                norm.eval()
         with self.autocast():
             loss, parts = total_loss(self.pair, batch, self.config)
         self.optimizer.zero_grad(set_to_none=True)
@@ -210,12 +211,15 @@ class Trainer:
         self.step += 1
         return {name: float(part) for name, part in parts.items()}
 
+    def _norms(self) -> list[torch.nn.BatchNorm2d]:
+        return [m for m in self.modules.modules() if isinstance(m, torch.nn.BatchNorm2d)]
+
     def settle(self, batches: Iterable[Batch]) -> None:
         """Set every batch norm to the plain mean over batches, seen with the weights as they are now.
 
         The running averages of training follow the last ten batches, which is noise in large blur.
         """
-        norms = [m for m in self.modules.modules() if isinstance(m, torch.nn.BatchNorm2d)]
+        norms = self._norms()
         momenta = [norm.momentum for norm in norms]
         self.modules.train()
         for norm in norms:
@@ -238,17 +242,6 @@ class Trainer:
         return Checkpoint(self.config, self.step, self.modules.state_dict(), self.optimizer.state_dict())
 
 
-def _progress(console: Console) -> Progress:
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    return Progress(*columns, console=console, speed_estimate_period=300)
-
-
 def train(
     config: TrainConfig,
     textures: Path,
@@ -267,22 +260,20 @@ def train(
     trainer = Trainer(config, device, resume)
     pool = Pool(config, photographs, trainer.step, workers)
     test = held_out(config.scenes, photographs, 2 * config.batch)
-    with _progress(console) as progress:
+    with progress_bar(console) as progress:
         for _ in progress.track(pool.fill(), total=pool.missing, description="scenes"):
             pass
         task = progress.add_task("training", total=config.steps, completed=trainer.step)
         recent: deque[dict[str, float]] = deque(maxlen=config.checkpoint_every)
         while trainer.step < config.steps:
+            if trainer.step == settling_step(config):
+                trainer.settle(pool.batch(config.steps + i) for i in range(config.settle_batches))
             recent.append(trainer.advance(pool.batch(trainer.step)))
             pool.refresh()
             progress.update(task, completed=trainer.step)
             if trainer.step % config.checkpoint_every == 0 or trainer.step == config.steps:
                 trainer.checkpoint().save(path)
                 console.print(_report(trainer.step, recent, trainer.validate(test)))
-    trainer.settle(pool.batch(config.steps + i) for i in range(config.settle_batches))
-    trainer.checkpoint().save(path)
-    settled = " ".join(f"{name} {value:.3f}" for name, value in trainer.validate(test).items())
-    console.print(f"settled: held out {settled}")
     return path
 
 

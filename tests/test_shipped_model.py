@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from model_export.cases import is_textured
 from model_export.config import SceneConfig
-from model_export.evaluate import is_textured
 from model_export.render import refocus
 from model_export.textures import draw_texture
 from service.config import SHIPPED_MODEL

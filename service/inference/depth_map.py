@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from service.inference.pair import MAPS, RawMaps, Side
+from service.inference.pair import RawMaps, Side
 from service.inference.resampling import Axis, sample
 from service.optics import thin_lens
 from service.optics.camera import Camera
@@ -15,6 +15,7 @@ from service.optics.camera import Camera
 MAX_RELATIVE_ERROR = 1.0
 SIGMA_OF_LAPLACE = np.float32(2**0.5)
 ROWS_AT_ONCE = 128
+DECIDED_FROM = ("blur_px", "log_ratio_near", "log_ratio_far", "p_near", "log_scale")
 
 Array = NDArray[np.float32]
 
@@ -125,7 +126,7 @@ def decide(readings: list[Reading], size: tuple[int, int], side: Side) -> tuple[
 def _band(reading: Reading, start: int, stop: int, side: Side) -> tuple[Layers, Array]:
     """Layers of some rows from one reading, and the relative error of depth there."""
     rows = reading.rows.part(start, stop)
-    at = {name: sample(reading.maps[name], rows, reading.columns) for name in MAPS}
+    at = {name: sample(reading.maps[name], rows, reading.columns) for name in DECIDED_FROM}
     camera = reading.camera
     x = thin_lens.relative_defocus_from_blur(at["blur_px"], camera.gamma_px, camera.k_cam_px)
     has_far = x < 1

@@ -23,7 +23,7 @@ from service.optics.camera import Camera
 Side = Literal["auto", "near", "far"]
 SIDE_HINTS: dict[Side, float] = {"auto": 0.0, "near": -1.0, "far": 1.0}
 BLUR_ERROR_RANGE = (0.01, 2.0)
-MAPS = ("blur_px", "log_ratio_near", "log_ratio_far", "p_near", "log_scale")
+MAPS = ("blur_px", "blur_log_error", "log_ratio_near", "log_ratio_far", "p_near", "log_scale")
 
 RawMaps = dict[str, NDArray[np.float32]]
 

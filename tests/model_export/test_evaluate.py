@@ -1,6 +1,7 @@
 """Evaluation, with a pair whose answers are known."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -8,21 +9,20 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from model_export.cases import Case, d200_cases, narrowed_cases, procedural_cases, shuffled_cases
 from model_export.cli import commands
-from model_export.evaluate import Case, answer, d200_cases, summarise
-from service.inference.artifact import load_model_folder
-from service.inference.estimator import Estimator
+from model_export.evaluate import Examiner, Pixels, blur_ranges, summarise
 from service.optics import thin_lens
 from service.optics.camera import Camera
-from tests.inference.oracle_pair import blur_of
+from tests.inference.oracle_pair import LOG_DEPTH_SCALE, RELATIVE_BLUR_ERROR, blur_of
 
 CAMERA = Camera(96, 64, 2.0, 6.0, 0.5)
 LEVEL = 90
 
 
 @pytest.fixture(scope="module")
-def oracle(tiny_model_dir: Path) -> Estimator:
-    return Estimator.from_folder(load_model_folder(tiny_model_dir))
+def oracle(tiny_model_dir: Path) -> Examiner:
+    return Examiner(tiny_model_dir)
 
 
 def case(factor: float) -> Case:
@@ -33,18 +33,48 @@ def case(factor: float) -> Case:
     return Case("grey", np.full((64, 96, 3), LEVEL, np.uint8), truth, CAMERA, "near")
 
 
-def test_a_right_answer_scores_nothing_and_a_wrong_one_its_error(oracle: Estimator) -> None:
-    assert answer(oracle, case(1.0)).scores.abs_rel == pytest.approx(0, abs=1e-3)
-    assert answer(oracle, case(2.0)).scores.abs_rel == pytest.approx(0.5, abs=1e-3)
+def test_a_right_answer_scores_nothing_and_a_wrong_one_its_error(oracle: Examiner) -> None:
+    for factor, error in ((1.0, 0.0), (2.0, 0.5)):
+        outcome, _ = oracle.answer(case(factor))
+        assert outcome.scores.abs_rel == pytest.approx(error, abs=1e-3)
+        assert outcome.scored_pixels == 64 * 86
 
 
-def test_a_summary_is_pooled_and_averaged(oracle: Estimator) -> None:
-    summary = summarise("two", [answer(oracle, case(1.0)), answer(oracle, case(2.0))])
+def test_a_summary_is_pooled_over_pixels_and_averaged_over_pictures(oracle: Examiner) -> None:
+    small = case(2.0)
+    small.truth_m[:, :53] = np.nan
+    summary = summarise("two", "gt", [oracle.answer(case(1.0))[0], oracle.answer(small)[0]])
     assert summary.pictures == 2
     assert summary.answered == 1
-    assert summary.mean.abs_rel == summary.pooled.abs_rel == pytest.approx(0.25, abs=1e-3)
+    assert summary.mean.abs_rel == pytest.approx(0.25, abs=1e-3)
+    assert summary.pooled.abs_rel == pytest.approx(0.5 / 3, abs=1e-3)
     with pytest.raises(ValueError, match="no picture"):
-        summarise("none", [])
+        summarise("none", "gt", [])
+
+
+def test_a_wrong_k_cam_is_told_to_the_estimator(oracle: Examiner) -> None:
+    """x is read too small by a tenth, so s1 / (1 + x) too far."""
+    right = case(1.0)
+    x = CAMERA.focus_distance_m / right.truth_m[0, -1] - 1
+    outcome, _ = oracle.answer(right, "k_cam +10%")
+    assert outcome.median_error == pytest.approx((1 + x) / (1 + x / 1.1) - 1, rel=1e-3)
+
+
+def test_certainty_and_blur_are_scored_where_they_are_known(oracle: Examiner) -> None:
+    known = replace(case(1.0), blur_px=np.full((64, 96), blur_of(LEVEL) * 0.8, np.float32))
+    outcome, _ = oracle.answer(known)
+    assert outcome.depth.stated == pytest.approx(LOG_DEPTH_SCALE * 2**0.5, rel=1e-3)
+    assert outcome.blur is not None
+    assert outcome.blur.stated == pytest.approx(RELATIVE_BLUR_ERROR * 2**0.5, rel=1e-3)
+    (found,) = (row for row in blur_ranges("grey", outcome.blur) if row.low_px == 2.0)
+    assert found.bias == found.median == found.certain_median == pytest.approx(0.25, rel=1e-3)
+
+
+def test_the_certain_half_is_that_of_the_least_stated_error() -> None:
+    stated = np.array([0.1, 0.2, np.inf, 0.9], np.float32)
+    pixels = Pixels(np.ones(4, np.float32), np.array([1, 1.1, 3, 2], np.float32), stated)
+    assert pixels.certain().tolist() == [True, True, False, False]
+    assert pixels.error == pytest.approx([0, 0.1, 2, 1])
 
 
 def write_photo(folder: Path, name: str, depth_mm: int) -> None:
@@ -66,13 +96,55 @@ def test_real_lenses_are_scored_away_from_steps(tmp_path: Path) -> None:
     assert found.camera.k_cam_px == pytest.approx(1.5326 * 640 / 645, rel=1e-3)
 
 
-def test_the_command_prints_and_writes_what_it_found(tmp_path: Path, tiny_model_dir: Path) -> None:
-    write_photo(tmp_path / "data" / "rgbd", "one", 900)
+def test_a_narrower_view_is_enlarged_and_blurs_alike(tmp_path: Path) -> None:
+    write_photo(tmp_path, "one", 900)
+    (found,) = narrowed_cases(tmp_path, 1, 0.5)
+    assert found.image.shape == (480, 640, 3)
+    assert found.camera.intrinsics is not None
+    assert found.camera.intrinsics.fx_px == 1050
+    assert np.nanmin(found.truth_m) == pytest.approx(0.9)
+
+
+def test_the_control_blurs_a_frame_by_the_depth_of_another(tmp_path: Path) -> None:
+    write_photo(tmp_path, "flat", 1000)
+    write_photo(tmp_path, "near", 500)
+    flat, near = shuffled_cases(tmp_path, 2)
+    assert np.nanmin(flat.truth_m) == pytest.approx(1.0)
+    contrast = [float(case.image[:, :300].std()) for case in (flat, near)]
+    assert contrast[0] < contrast[1]
+
+
+@pytest.mark.parametrize("side", [-1, 0, 1])
+def test_procedural_scenes_come_with_both_truths(side: int) -> None:
+    (found,) = procedural_cases(1, side)
+    assert found.blur_px is not None
+    camera = found.camera
+    expected = thin_lens.blur_at_depth(found.truth_m, camera.focus_distance_m, camera.k_cam_px, camera.gamma_px)
+    np.testing.assert_allclose(found.blur_px, expected, rtol=2e-3, atol=2e-3)
+    beyond = (found.truth_m > camera.focus_distance_m).mean()
+    assert beyond == {-1: 0, 1: 1}.get(side, beyond)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("data")
+    write_photo(folder / "rgbd", "one", 900)
+    write_photo(folder / "tabletop", "two", 700)
+    return folder
+
+
+def test_the_command_prints_and_writes_what_it_found(data: Path, tiny_model_dir: Path, tmp_path: Path) -> None:
     out = tmp_path / "report"
-    arguments = ["--data", tmp_path / "data", "--model", tiny_model_dir, "--quick", "--out", out]
+    arguments = ["--data", data, "--model", tiny_model_dir, "--quick", "--out", out]
     result = CliRunner().invoke(commands, ["evaluate", *map(str, arguments)])
     assert result.exit_code == 0, result.output
-    assert "best constant" in " ".join(result.output.split()) or "constant" in result.output
+    for said in ("rgbd k_cam 3.81", "k_cam -10%", "tabletop shuffled", "procedural mixed", "report.html"):
+        assert said in result.output
     report = json.loads((out / "report.json").read_text())
-    assert report["sets"]["rgbd"]["pictures"] == 1
-    assert (out / "rgbd.png").exists()
+    sets = {(s["name"], s["mode"]): s for s in report["sets"]}
+    assert sets["indoor k_cam 3.81", "gt"]["pictures"] == 2
+    assert sets["rgbd k_cam 3.81", "no k_cam"]["pooled"]["rmse"] > 0
+    page = (out / "report.html").read_text()
+    shown = [part.split('"')[0] for part in page.split('src="')[1:]]
+    assert len(shown) > 10
+    assert all((out / name).stat().st_size > 500 for name in shown)

@@ -1,0 +1,227 @@
+"""What a model is scored on: pictures with a camera and the truth, made from the development data or drawn."""
+
+import itertools
+import json
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from model_export.config import SceneConfig
+from model_export.datasets.photos import Photo, filled, load_photos
+from model_export.render import refocus
+from model_export.scenes import draw_sample, true_blur_px
+from model_export.train import HELD_OUT_SEED
+from service.inference.pair import Side
+from service.optics import thin_lens
+from service.optics.camera import Camera, Intrinsics, Lens
+
+REFERENCE = Camera(640, 480, 2.0, 3.81, 0.5, intrinsics=Intrinsics(525.0, 525.0, 319.5, 239.5))
+UNSEEN_K_CAM_PX = (2.64, 3.81, 6.80, 10.7)
+PLANES_M = (0.7, 1.0, 1.5)
+VIEWS = (0.6, 0.8)
+NEAR_LIMIT_M = 2.0
+LEAST_SCORED = 0.02
+D200 = Lens(35.0, 2.8, 6.05, 3872)
+D200_LIMIT_M = 5.0
+D200_STEP = 0.05
+D200_STEP_MARGIN_PX = 25
+CELL_PX = 32
+CELL_CONTRAST = 0.03
+TEXTURED_SHARE = 0.6
+SIDES: dict[int, Side] = {-1: "near", 0: "auto", 1: "far"}
+PROCEDURAL_SIDES = {"near": -1, "far": 1, "mixed": 0}
+
+Map = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One picture to answer: ``truth_m`` is NaN where it is not scored, ``blur_px`` None where lambda is not known."""
+
+    name: str
+    image: NDArray[np.uint8]
+    truth_m: Map
+    camera: Camera
+    side: Side
+    blur_px: Map | None = None
+
+
+CaseSource = Callable[[], Iterator[Case]]
+
+
+def to_pixels(picture: Map) -> NDArray[np.uint8]:
+    """A picture in 0..1 as eight bits."""
+    return (picture * 255 + 0.5).astype(np.uint8)
+
+
+def _encoded(photo: Photo) -> Map:
+    return photo.image.astype(np.float32) / np.float32(255)
+
+
+def _sharp_texture(photo: Photo) -> Map:
+    """A frame halved, so that its own softness is gone, and mirrored back to its size; sRGB 0..1."""
+    height, width = photo.image.shape[:2]
+    half = cv2.resize(photo.image, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+    tiled = cv2.copyMakeBorder(half, 0, height - height // 2, 0, width - width // 2, cv2.BORDER_REFLECT)
+    return np.asarray(tiled, np.float32) / np.float32(255)
+
+
+def is_textured(texture: Map) -> bool:
+    """Whether most cells of 32 px have a contrast (standard deviation of brightness) above 3 %."""
+    height, width = (size // CELL_PX * CELL_PX for size in texture.shape[:2])
+    grey = texture[:height, :width].mean(2)
+    cells = grey.reshape(height // CELL_PX, CELL_PX, width // CELL_PX, CELL_PX).std((1, 3))
+    return float((cells > CELL_CONTRAST).mean()) >= TEXTURED_SHARE
+
+
+def plane_cases(data: Path, depth_m: float, count: int) -> Iterator[Case]:
+    """Textured planes at one distance, refocused with the reference camera; a bare wall is no textured plane."""
+    for folder in ("rgbd", "tabletop"):
+        sharp = [(photo, _sharp_texture(photo)) for photo in load_photos(data / folder)]
+        textured = [(photo, texture) for photo, texture in sharp if is_textured(texture)]
+        for photo, texture in textured[:: max(1, len(textured) // max(1, count // 2))][: count // 2]:
+            plane = np.full(texture.shape[:2], depth_m, np.float32)
+            picture = to_pixels(refocus(texture, plane, REFERENCE))
+            yield Case(f"{photo.name} at {depth_m} m", picture, plane, REFERENCE, "near")
+
+
+def _to_limit(depth_m: Map) -> Map:
+    with np.errstate(invalid="ignore"):
+        return np.where(depth_m <= NEAR_LIMIT_M, depth_m, np.float32(np.nan)).astype(np.float32)
+
+
+def refocused_cases(folder: Path, count: int, camera: Camera = REFERENCE) -> Iterator[Case]:
+    """Sharp frames with depth, refocused with a camera; scored to 2 m."""
+    for photo in _spread(folder, count):
+        picture = to_pixels(refocus(_encoded(photo), filled(photo.depth_m), camera))
+        yield Case(photo.name, picture, _to_limit(photo.depth_m), camera, "near")
+
+
+def shuffled_cases(folder: Path, count: int) -> Iterator[Case]:
+    """A control: each frame blurred by the depth of the next one, scored on its own. Nothing can be right here.
+
+    What is answered well all the same was not read from blur.
+    """
+    photos = list(_spread(folder, count))
+    for photo, other in zip(photos, (*photos[1:], photos[0]), strict=True):
+        if other.depth_m.shape == photo.depth_m.shape:
+            picture = to_pixels(refocus(_encoded(photo), filled(other.depth_m), REFERENCE))
+            yield Case(photo.name, picture, _to_limit(photo.depth_m), REFERENCE, "near")
+
+
+def narrowed_cases(folder: Path, count: int, view: float) -> Iterator[Case]:
+    """Frames cut to the middle ``view`` of their width and enlarged again: a longer lens with the same k_cam."""
+    for photo in _spread(folder, count):
+        height, width = photo.image.shape[:2]
+        top, left = round(height * (1 - view) / 2), round(width * (1 - view) / 2)
+        cut = (slice(top, height - top), slice(left, width - left))
+        picture = cv2.resize(_encoded(photo)[cut], (width, height), interpolation=cv2.INTER_CUBIC)
+        depth = cv2.resize(photo.depth_m[cut], (width, height), interpolation=cv2.INTER_NEAREST)
+        fx_px = 525.0 / view
+        inner = Intrinsics(fx_px, fx_px, (width - 1) / 2, (height - 1) / 2)
+        camera = replace(REFERENCE, intrinsics=inner)
+        depth_m = np.asarray(depth, np.float32)
+        blurred = refocus(np.clip(np.asarray(picture, np.float32), 0, 1), filled(depth_m), camera)
+        yield Case(photo.name, to_pixels(blurred), _to_limit(depth_m), camera, "near")
+
+
+def d200_cases(folder: Path, count: int) -> Iterator[Case]:
+    """Real photographs of a real lens, known by its specs alone; scored away from depth steps and to 5 m."""
+    for photo in _spread(folder, count):
+        height, width = photo.image.shape[:2]
+        fx = D200.fx_px(width)
+        inner = Intrinsics(fx, fx, (width - 1) / 2, (height - 1) / 2)
+        camera = Camera(width, height, 2.0, D200.k_cam_px(2.0, width), 0.5, D200.focal_length_m, inner)
+        truth = photo.depth_m.copy()
+        truth[_near_steps(filled(truth)) | (filled(truth) > D200_LIMIT_M)] = np.nan
+        yield Case(photo.name, photo.image, truth, camera, "auto")
+
+
+def _near_steps(depth_m: Map) -> NDArray[np.bool_]:
+    """Pixels within the margin of a step of more than 5 % between neighbours."""
+    kernel = np.ones((3, 3), np.uint8)
+    ratio = cv2.dilate(depth_m, kernel) / cv2.erode(depth_m, kernel)
+    step = (np.asarray(ratio) > 1 + D200_STEP).astype(np.uint8)
+    size = 2 * D200_STEP_MARGIN_PX + 1
+    return np.asarray(cv2.dilate(step, np.ones((size, size), np.uint8))) > 0
+
+
+def procedural_cases(count: int, side: int) -> Iterator[Case]:
+    """Procedural scenes of seeds and textures that no training drew: all nearer (-1), farther (1), or both (0)."""
+    drawn = (draw_sample(HELD_OUT_SEED + number, SceneConfig(), []) for number in itertools.count())
+    for sample in itertools.islice((s for s in drawn if s.shot.side == side), count):
+        shot = sample.shot
+        height, width = sample.excess.shape
+        fx = shot.focal_length_px
+        inner = Intrinsics(fx, fx, (width - 1) / 2, (height - 1) / 2)
+        camera = Camera(width, height, shot.focus_distance_m, shot.k_cam_px, shot.gamma_px, intrinsics=inner)
+        truth = np.float32(shot.focus_distance_m) / (1 + sample.excess.astype(np.float32))
+        image = np.ascontiguousarray(sample.image.transpose(1, 2, 0))
+        yield Case("procedural", image, truth, camera, SIDES[side], true_blur_px(sample))
+
+
+def blender_cases(folder: Path, count: int) -> Iterator[Case]:
+    """Ray-traced thin-lens scenes of ``camind blender``; the side is not told."""
+    cameras = json.loads((folder / "cameras.json").read_text())
+    for photo in _spread(folder, count):
+        height, width = photo.image.shape[:2]
+        told = cameras[photo.name]
+        inner = Intrinsics(told["fx_px"], told["fx_px"], (width - 1) / 2, (height - 1) / 2)
+        camera = Camera(width, height, told["focus_distance_m"], told["k_cam_px"], told["gamma_px"], intrinsics=inner)
+        blur_px = thin_lens.blur_at_depth(photo.depth_m, camera.focus_distance_m, camera.k_cam_px, camera.gamma_px)
+        yield Case(photo.name, photo.image, photo.depth_m, camera, "auto", blur_px)
+
+
+def _spread(folder: Path, count: int) -> Iterator[Photo]:
+    """About ``count`` of a folder's photos, spread over it."""
+    total = len(list((folder / "color").glob("*")))
+    return load_photos(folder, max(1, math.ceil(total / count)))
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """A named set, and the modes (see ``evaluate.MODES``) in which its pictures are answered."""
+
+    name: str
+    cases: CaseSource
+    modes: tuple[str, ...] = ("gt",)
+
+
+def _enough(source: CaseSource) -> Iterator[Case]:
+    """The cases of which enough can be scored."""
+    return (case for case in source() if np.isfinite(case.truth_m).mean() > LEAST_SCORED)
+
+
+def trials(data: Path, quick: bool) -> list[Trial]:
+    """The sets that the data folder can serve; a missing folder is a missing set."""
+    few, many, scenes = (2, 4, 12) if quick else (8, 40, 60)
+    found: list[Trial] = []
+
+    def add(name: str, source: CaseSource, *further_modes: str) -> None:
+        found.append(Trial(name, partial(_enough, source), ("gt", *further_modes)))
+
+    for name, side in PROCEDURAL_SIDES.items():
+        add(f"procedural {name}", partial(procedural_cases, scenes, side))
+    if (data / "blender" / "cameras.json").is_file():
+        add("blender", partial(blender_cases, data / "blender", 2 * scenes))
+    indoor = [data / name for name in ("rgbd", "tabletop") if (data / name).is_dir()]
+    if len(indoor) == 2:
+        for depth_m in PLANES_M:
+            add(f"plane {depth_m:g} m", partial(plane_cases, data, depth_m, few))
+    for folder in indoor:
+        for k_cam_px in (REFERENCE.k_cam_px,) if quick else UNSEEN_K_CAM_PX:
+            camera = replace(REFERENCE, k_cam_px=k_cam_px)
+            further = ("no k_cam", "k_cam -10%", "k_cam +10%") if camera == REFERENCE else ("no k_cam",)
+            add(f"{folder.name} k_cam {k_cam_px:g}", partial(refocused_cases, folder, many, camera), *further)
+        add(f"{folder.name} shuffled", partial(shuffled_cases, folder, many))
+        for view in VIEWS:
+            add(f"{folder.name} view {view:g}", partial(narrowed_cases, folder, many, view))
+    if (data / "d200").is_dir():
+        add("d200", partial(d200_cases, data / "d200", 2 * many))
+    return found

@@ -1,0 +1,204 @@
+"""Ray-traced thin-lens scenes with exact depth, by Blender's Cycles: a check of our renderer, and an evaluation set.
+
+Blender comes as a Python module that cannot share an environment with ours: ``environment`` makes one of its own on
+demand and ``render`` drives ``blender_worker.py`` in it. Cycles' lens has its image plane at the focal length, so
+k_cam = f^2 / (k_r N s1 p) there, with s1 where eq. 2 has s1 - f.
+"""
+
+import json
+import math
+import random
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from model_export.render import PIXEL_BOX_VARIANCE, blur, encode_srgb
+from service.optics import thin_lens
+
+BPY = "bpy==5.0.1"
+PYTHON = "python3.11"
+WORKER = Path(__file__).with_name("blender_worker.py")
+EDGE_ANGLE = math.radians(5)
+EDGE_SIGMAS_PX = (0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0)
+EDGE_EXCESS = 0.5
+EDGE_OVERSAMPLE = 8
+EDGE_TOLERANCE = 0.03
+GAMMA_PX = 0.5
+MILLIMETRES = 1000.0
+
+Map = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What the worker renders: a slanted ``edge`` at one depth, or a ``room`` with solids drawn from its seed."""
+
+    name: str
+    kind: str
+    seed: int
+    size_px: int
+    focus_distance_m: float
+    k_cam_px: float
+    focal_length_mm: float
+    sensor_width_mm: float
+    samples: int
+    depth_m: float | None = None
+
+    @property
+    def fx_px(self) -> float:
+        return self.focal_length_mm / self.sensor_width_mm * self.size_px
+
+
+def edges(size_px: int = 128, samples: int = 1024) -> list[Scene]:
+    """Slanted edges of every sigma in ``EDGE_SIGMAS_PX`` before and behind the plane in focus."""
+    found = []
+    for sigma_px in EDGE_SIGMAS_PX:
+        for side, depth_m in (
+            ("near", thin_lens.depth_near(EDGE_EXCESS, 2.0)),
+            ("far", thin_lens.depth_far(EDGE_EXCESS, 2.0)),
+        ):
+            k_cam_px = sigma_px / EDGE_EXCESS
+            name = f"edge_{side}_{sigma_px:g}"
+            found.append(Scene(name, "edge", 1, size_px, 2.0, k_cam_px, 50.0, 36.0, samples, depth_m))
+    return found
+
+
+def rooms(count: int, size_px: int = 256, samples: int = 64) -> list[Scene]:
+    """Rooms by cameras with k_cam 0.8 to 15 px, focused at 0.4 to 4 m."""
+    found = []
+    for seed in range(count):
+        dice = random.Random(seed)
+        focus_m, k_cam_px = (math.exp(dice.uniform(math.log(a), math.log(b))) for a, b in ((0.4, 4), (0.8, 15)))
+        focal_mm = dice.uniform(25, 70)
+        found.append(Scene(f"room_{seed:03d}", "room", seed, size_px, focus_m, k_cam_px, focal_mm, 36.0, samples))
+    return found
+
+
+def environment(folder: Path) -> Path:
+    """The Python of an environment that has Blender; made in ``folder`` if it is not there yet (370 MB).
+
+    Raises ``FileNotFoundError`` without the Python that Blender is built for, ``RuntimeError`` if it cannot be
+    installed.
+    """
+    python = folder / "bin" / "python"
+    if python.exists():
+        return python
+    base = shutil.which(PYTHON)
+    if base is None:
+        raise FileNotFoundError(f"{BPY} needs {PYTHON}, which is not on the path")
+    for command in ([base, "-m", "venv", str(folder)], [str(python), "-m", "pip", "install", "--quiet", BPY]):
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise RuntimeError(f"{' '.join(command)} failed: {done.stderr.strip()[-500:]}")
+    return python
+
+
+def render(python: Path, scenes: list[Scene], out: Path, on_progress: Callable[[str], None] = lambda _: None) -> None:
+    """Render to ``out``/NAME.npz (``light`` linear [h,w,3], ``depth_m`` [h,w]); what is there is kept.
+
+    Raises ``RuntimeError`` with the worker's last words if it fails.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as scratch:
+        specs = Path(scratch) / "scenes.json"
+        specs.write_text(json.dumps([asdict(scene) for scene in scenes]))
+        command = [str(python), str(WORKER), str(specs), str(out)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as worker:
+            said: list[str] = []
+            for line in worker.stdout or ():
+                said.append(line)
+                if line.startswith("rendered "):
+                    on_progress(line.split()[1])
+        if worker.returncode:
+            raise RuntimeError(f"Blender failed: {''.join(said[-10:])}")
+
+
+def sharp_edge(size_px: int) -> Map:
+    """The worker's edge [h,w] without blur, seen by square pixels: the part of each that is white."""
+    fine = (np.arange(size_px * EDGE_OVERSAMPLE) + 0.5) / EDGE_OVERSAMPLE - size_px / 2
+    distance = fine[None, :] * math.cos(EDGE_ANGLE) - fine[:, None] * math.sin(EDGE_ANGLE)
+    white = np.clip(distance * EDGE_OVERSAMPLE + 0.5, 0, 1).astype(np.float32)
+    return np.asarray(cv2.resize(white, (size_px, size_px), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def edge_sigma(light: Map, expected_px: float) -> float:
+    """Standard deviation of the point spread, px, from a picture [h,w] of the worker's edge: whatever its shape.
+
+    The slope of each row is the line spread, widened by the edge's slant; what an edge without blur shows, the pixels'
+    own box among it, is taken off. Only where a disc of ``expected_px`` reaches is looked at: beyond, a band-limited
+    disc rings.
+    """
+    reach = 2 * expected_px + 3
+    variances = [_row_variance(picture, reach) for picture in (light, sharp_edge(len(light)))]
+    return math.sqrt(variances[0] - variances[1]) * math.cos(EDGE_ANGLE)
+
+
+def _row_variance(picture: Map, reach: float) -> float:
+    size = len(picture)
+    border = math.ceil(reach + 2)
+    rows = np.arange(border, size - border)
+    at = np.arange(1, size) - size / 2
+    offset = at[None, :] - (rows[:, None] + 0.5 - size / 2) * math.tan(EDGE_ANGLE)
+    weight = np.diff(picture[rows].astype(np.float64), axis=1) * (np.abs(offset) <= reach)
+    weight /= weight.sum(1, keepdims=True)
+    return float((weight * (offset - (weight * offset).sum(1, keepdims=True)) ** 2).sum(1).mean())
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeResult:
+    """One slanted edge: sigma by eq. 7, as Cycles rendered it, and as our renderer does."""
+
+    name: str
+    expected_px: float
+    cycles_px: float
+    ours_px: float
+
+
+def compare_edge(scene: Scene, light: Map) -> EdgeResult:
+    """Measure a rendered edge [h,w] and ours by the same means."""
+    depth_m = scene.depth_m or math.nan
+    expected = thin_lens.defocus_at_depth(depth_m, scene.focus_distance_m, scene.k_cam_px)
+    ours = blur(torch.from_numpy(sharp_edge(scene.size_px)), expected, disc_share=1.0).numpy()
+    return EdgeResult(scene.name, expected, edge_sigma(light, expected), edge_sigma(ours, expected))
+
+
+def compare_edges(rendered: Path, scenes: list[Scene]) -> Iterator[EdgeResult]:
+    """All rendered edges below a folder, measured."""
+    for scene in scenes:
+        yield compare_edge(scene, np.load(rendered / f"{scene.name}.npz")["light"][..., 1])
+
+
+def develop(rendered: Path, scenes: list[Scene], out: Path) -> None:
+    """Rendered rooms as an evaluation set: ``color/``, ``depth/`` (16-bit millimetres) and ``cameras.json``.
+
+    gamma is brought to 0.5 px, brightness to the 98th percentile; depth beyond 65 m is unknown.
+    """
+    for part in ("color", "depth"):
+        (out / part).mkdir(parents=True, exist_ok=True)
+    cameras = {}
+    for scene in scenes:
+        found = np.load(rendered / f"{scene.name}.npz")
+        light = torch.from_numpy(found["light"].transpose(2, 0, 1).copy())
+        margin = 8
+        padded = torch.nn.functional.pad(light[None], (margin,) * 4, mode="reflect")[0]
+        soft = blur(padded, math.sqrt(GAMMA_PX**2 - PIXEL_BOX_VARIANCE))[:, margin:-margin, margin:-margin]
+        picture = encode_srgb((soft / soft.quantile(0.98).clamp_min(1e-3)).permute(1, 2, 0).numpy())
+        depth_mm = np.where(found["depth_m"] < 65, found["depth_m"] * MILLIMETRES, 0)
+        cv2.imwrite(str(out / "color" / f"{scene.name}.png"), np.rint(picture[:, :, ::-1] * 255).astype(np.uint8))
+        cv2.imwrite(str(out / "depth" / f"{scene.name}.png"), np.rint(depth_mm).astype(np.uint16))
+        cameras[scene.name] = {
+            "focus_distance_m": scene.focus_distance_m,
+            "k_cam_px": scene.k_cam_px,
+            "gamma_px": GAMMA_PX,
+            "fx_px": scene.fx_px,
+        }
+    (out / "cameras.json").write_text(json.dumps(cameras, indent=1) + "\n")
