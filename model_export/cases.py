@@ -35,6 +35,8 @@ CELL_PX = 32
 CELL_CONTRAST = 0.03
 TEXTURED_SHARE = 0.6
 SIDES: dict[int, Side] = {-1: "near", 0: "auto", 1: "far"}
+FIXED = "fixed"
+FIXED_SCENES = 6
 PROCEDURAL_SIDES = {"near": -1, "far": 1, "mixed": 0}
 
 Map = NDArray[np.float32]
@@ -166,6 +168,12 @@ def procedural_cases(count: int, side: int) -> Iterator[Case]:
         yield Case("procedural", image, truth, camera, SIDES[side], true_blur_px(sample))
 
 
+def fixed_cases() -> Iterator[Case]:
+    """A few procedural scenes of every side: needs no data, so tests can hold a model to what its card says."""
+    for side in PROCEDURAL_SIDES.values():
+        yield from procedural_cases(FIXED_SCENES, side)
+
+
 def blender_cases(folder: Path, count: int) -> Iterator[Case]:
     """Ray-traced thin-lens scenes of ``camind blender``; the side is not told."""
     cameras = json.loads((folder / "cameras.json").read_text())
@@ -206,6 +214,7 @@ def trials(data: Path, quick: bool) -> list[Trial]:
     def add(name: str, source: CaseSource, *further_modes: str) -> None:
         found.append(Trial(name, partial(_enough, source), ("gt", *further_modes)))
 
+    add(FIXED, fixed_cases)
     for name, side in PROCEDURAL_SIDES.items():
         add(f"procedural {name}", partial(procedural_cases, scenes, side))
     if (data / "blender" / "cameras.json").is_file():

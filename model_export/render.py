@@ -27,40 +27,60 @@ SOFT_EDGE_VARIANCE = 0.25
 
 
 @dataclass(frozen=True, slots=True)
+class PointSpread:
+    """The shape of defocus, whatever its size.
+
+    ``disc_share`` of the variance is a uniform disc (whose standard deviation is a quarter of its diameter), the rest
+    a Gaussian; 0 is a Gaussian, 1 a disc with edges as soft as a pixel. ``squeeze`` is the ratio of the disc's axes and
+    ``angle`` (rad) where the longer one points, as the barrel of a lens cuts it away from the axis (cat's eye); the
+    mean variance per axis stays. ``chromatic_px`` moves red and blue along the signed defocus, green being in place.
+    """
+
+    disc_share: float = 0.0
+    squeeze: float = 1.0
+    angle: float = 0.0
+    chromatic_px: tuple[float, float] = (0.0, 0.0)
+
+
+GAUSSIAN = PointSpread()
+DISC = PointSpread(1.0)
+
+
+@dataclass(frozen=True, slots=True)
 class Layer:
-    """A sharp surface: premultiplied linear colour [3,h,w], alpha [1,h,w], defocus sigma [h,w] in px."""
+    """A sharp surface: premultiplied linear colour [3,h,w], alpha [1,h,w], signed defocus k_cam d [h,w] in px."""
 
     color: Tensor
     alpha: Tensor
     defocus_px: Tensor
 
 
-def transfer(height: int, width: int, sigma_px: float, disc_share: float) -> Tensor:
+def transfer(height: int, width: int, sigma_px: float, spread: PointSpread) -> Tensor:
     """Transfer function [h, w//2+1] of a point spread with standard deviation ``sigma_px`` per axis.
 
-    ``disc_share`` of the variance is a uniform disc (whose standard deviation is a quarter of its
-    diameter), the rest a Gaussian; 0 is a Gaussian, 1 a disc with edges as soft as a pixel. The Gaussian is the
-    discrete one (Lindeberg 1990, exp(s^2 (cos w - 1)) per axis): positive and of exact variance at any sigma,
-    where a sampled or band-limited one of half a pixel rings.
+    The Gaussian is the discrete one (Lindeberg 1990, exp(s^2 (cos w - 1)) per axis): positive and of exact variance
+    at any sigma, where a sampled or band-limited one of half a pixel rings.
     """
     fy = torch.fft.fftfreq(height)[:, None]
     fx = torch.fft.rfftfreq(width)[None, :]
     variance = sigma_px**2
-    gauss_variance = max((1 - disc_share) * variance, min(variance, SOFT_EDGE_VARIANCE))
+    gauss_variance = max((1 - spread.disc_share) * variance, min(variance, SOFT_EDGE_VARIANCE))
     falling = torch.cos(2 * math.pi * fy) + torch.cos(2 * math.pi * fx) - 2
     gauss = torch.exp(gauss_variance * falling)
     if gauss_variance >= variance:
         return gauss
-    radius_px = 2 * math.sqrt(variance - gauss_variance)
-    t = (2 * math.pi * radius_px * torch.sqrt(fy * fy + fx * fx)).clamp_min(1e-4)
+    longer_px = 2 * math.sqrt((variance - gauss_variance) * 2 / (1 + spread.squeeze**2))
+    along = fx * math.cos(spread.angle) + fy * math.sin(spread.angle)
+    across = fy * math.cos(spread.angle) - fx * math.sin(spread.angle)
+    t = (2 * math.pi * longer_px * torch.sqrt(along**2 + (spread.squeeze * across) ** 2)).clamp_min(1e-4)
     disc: Tensor = 2 * torch.special.bessel_j1(t) / t
     return gauss * disc
 
 
-def blur(image: Tensor, sigma_px: float, disc_share: float = 0.0) -> Tensor:
+def blur(image: Tensor, sigma_px: float, spread: PointSpread = GAUSSIAN) -> Tensor:
     """Blur [..., h, w] by one point spread; the image wraps around, so callers give it a margin."""
     height, width = image.shape[-2:]
-    spectrum = torch.fft.rfft2(image) * transfer(height, width, sigma_px, disc_share)
+    spectrum = torch.fft.rfft2(image) * transfer(height, width, sigma_px, spread)
     out: Tensor = torch.fft.irfft2(spectrum, s=(height, width))
     return out
 
@@ -75,11 +95,11 @@ def blur_levels(low_px: float, high_px: float) -> list[float]:
     return [base * math.exp(span * i / (count - 1)) - LEVEL_OFFSET_PX for i in range(count)]
 
 
-def blur_varying(image: Tensor, sigma_px: Tensor, disc_share: float) -> Tensor:
+def blur_varying(image: Tensor, sigma_px: Tensor, spread: PointSpread) -> Tensor:
     """Blur [c,h,w] by a point spread whose sigma [h,w] varies slowly: levels mixed so that variance is exact."""
     levels = blur_levels(float(sigma_px.min()), float(sigma_px.max()))
     if len(levels) == 1:
-        return blur(image, levels[0], disc_share)
+        return blur(image, levels[0], spread)
     height, width = image.shape[-2:]
     spectrum = torch.fft.rfft2(image)
     variance = sigma_px * sigma_px
@@ -92,13 +112,13 @@ def blur_varying(image: Tensor, sigma_px: Tensor, disc_share: float) -> Tensor:
         if i + 1 < len(levels):
             above = levels[i + 1] ** 2
             weight = torch.minimum(weight, (above - variance) / (above - level**2))
-        otf = transfer(height, width, level, disc_share)
+        otf = transfer(height, width, level, spread)
         out += weight.clamp_min(0) * torch.fft.irfft2(spectrum * otf, s=(height, width))
     return out
 
 
 def composite(layers: Iterable[tuple[Tensor, Tensor]]) -> Tensor:
-    """Put blurred (colour premultiplied [3,h,w], alpha [1,h,w]) over each other, nearest first.
+    """Put blurred (colour premultiplied [3,h,w], alpha [1 or 3,h,w]) over each other, nearest first.
 
     The last layer must be opaque; what little it lacks is divided out, so a constant stays constant. Alpha is
     not clamped: a band-limited disc rings by a percent, colour and alpha alike, and cutting one alone would show.
@@ -113,20 +133,27 @@ def composite(layers: Iterable[tuple[Tensor, Tensor]]) -> Tensor:
     return image / (1 - clear).clamp_min(1e-3)
 
 
-def render_layers(layers: list[Layer], disc_share: float) -> tuple[Tensor, Tensor]:
+def _blurred(layer: Layer, spread: PointSpread) -> tuple[Tensor, Tensor]:
+    """Colour [3,h,w] and alpha [1 or 3,h,w]; each colour by its own defocus where the lens is not achromatic."""
+    red, blue = spread.chromatic_px
+    if red == blue == 0:
+        out = blur_varying(torch.cat([layer.color, layer.alpha]), layer.defocus_px.abs(), spread)
+        return out[:3], out[3:]
+    planes = [
+        blur_varying(torch.cat([layer.color[i : i + 1], layer.alpha]), (layer.defocus_px + shift).abs(), spread)
+        for i, shift in enumerate((red, 0.0, blue))
+    ]
+    return torch.stack([p[0] for p in planes]), torch.stack([p[1] for p in planes])
+
+
+def render_layers(layers: list[Layer], spread: PointSpread) -> tuple[Tensor, Tensor]:
     """Linear picture [3,h,w] of layers given nearest first, the last one opaque, and each pixel's layer [h,w].
 
-    A pixel belongs to the layer that most of its light comes from: a twig blurred over more than its width is
+    A pixel belongs to the layer that most of its (green) light comes from: a twig blurred over more than its width is
     not what one sees there.
     """
-
-    def blurred(layer: Layer) -> tuple[Tensor, Tensor]:
-        rgba = torch.cat([layer.color, layer.alpha])
-        out = blur_varying(rgba, layer.defocus_px, disc_share)
-        return out[:3], out[3:]
-
-    parts = [blurred(layer) for layer in layers]
-    alpha = torch.cat([part for _, part in parts])
+    parts = [_blurred(layer, spread) for layer in layers]
+    alpha = torch.stack([part[len(part) // 2] for _, part in parts])
     clear = torch.cat([torch.ones_like(alpha[:1]), torch.cumprod(1 - alpha, 0)[:-1]])
     return composite(parts), (clear * alpha).argmax(0)
 
@@ -164,7 +191,7 @@ def _filled(image: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np.
 
 
 def refocus(
-    image: NDArray[np.float32], depth_m: NDArray[np.float32], camera: Camera, disc_share: float = 1.0
+    image: NDArray[np.float32], depth_m: NDArray[np.float32], camera: Camera, spread: PointSpread = DISC
 ) -> NDArray[np.float32]:
     """The picture [h,w,3] in 0..1 (sRGB) that ``camera`` would take of a sharp RGB picture with depth [h,w].
 
@@ -187,7 +214,7 @@ def refocus(
             color = _filled(linear, index >= number) * shown[..., None]
             rgba = torch.from_numpy(np.concatenate([color, shown[..., None]], axis=2).astype(np.float32))
             level = float(sigma[index == number].mean())
-            out = blur(rgba.permute(2, 0, 1), level, disc_share)
+            out = blur(rgba.permute(2, 0, 1), level, spread)
             yield out[:3], out[3:]
 
     rest = math.sqrt(max(camera.gamma_px**2 - PIXEL_BOX_VARIANCE, 0.0))

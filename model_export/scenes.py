@@ -5,7 +5,7 @@ sigma = k_cam |q - 1|; q > 1 is nearer than focus, q < 1 beyond.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from model_export.config import SceneConfig
-from model_export.render import PIXEL_BOX_VARIANCE, Layer, blur, decode_srgb, encode_srgb, render_layers
+from model_export.render import PIXEL_BOX_VARIANCE, Layer, PointSpread, blur, decode_srgb, encode_srgb, render_layers
 from model_export.textures import draw_texture
 from service.optics import thin_lens
 
@@ -21,6 +21,14 @@ SIDES = ("near", "far", "both")
 SIDE_SHARES = (0.45, 0.2, 0.35)
 LAYERED_SHARE = 0.7
 K_CAM_LEAN = 0.6  # cameras with little blur need fewer examples than those with much
+ROUND_SHARE = 0.7
+CHROMATIC_SHARE = 0.4
+CHROMATIC_PX = 0.8
+CHROMATIC_PART = 0.15
+MOSAIC_SHARE = 0.4
+MOSAIC_VARIANCE = 0.35  # what a bilinear demosaic adds to luminance, px^2
+RESCALED_SHARE = 0.15
+RESCALES = (1.2, 1.6)
 Map = NDArray[np.float32]
 
 
@@ -32,7 +40,7 @@ class Shot:
     gamma_px: float
     focus_distance_m: float
     focal_length_px: float
-    disc_share: float
+    spread: PointSpread
     side: int
 
 
@@ -53,17 +61,26 @@ def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float], lean: fl
 
 def draw_shot(rng: np.random.Generator, config: SceneConfig) -> Shot:
     """A random camera, focus distance, lens and side of focus within the config's ranges."""
-    shape = rng.random()
-    disc_share = 0.0 if shape < 0.25 else 1.0 if shape > 0.65 else rng.uniform(0.3, 1.0)
     side = rng.choice(3, p=SIDE_SHARES)
+    k_cam_px = _log_uniform(rng, config.k_cam_px, K_CAM_LEAN)
     return Shot(
-        k_cam_px=_log_uniform(rng, config.k_cam_px, K_CAM_LEAN),
+        k_cam_px=k_cam_px,
         gamma_px=rng.uniform(*config.gamma_px),
         focus_distance_m=_log_uniform(rng, config.focus_distance_m),
         focal_length_px=_log_uniform(rng, config.focal_length_px),
-        disc_share=float(disc_share),
+        spread=_draw_spread(rng, k_cam_px),
         side=(-1, 1, 0)[side],
     )
+
+
+def _draw_spread(rng: np.random.Generator, k_cam_px: float) -> PointSpread:
+    """A Gaussian, a disc or between; sometimes squeezed; sometimes red and blue focused elsewhere than green."""
+    shape = rng.random()
+    disc_share = 0.0 if shape < 0.25 else 1.0 if shape > 0.65 else rng.uniform(0.3, 1.0)
+    squeeze = 1.0 if rng.random() < ROUND_SHARE else rng.uniform(0.7, 1.0)
+    shift = min(CHROMATIC_PX, CHROMATIC_PART * k_cam_px) if rng.random() < CHROMATIC_SHARE else 0.0
+    red, blue = rng.uniform(-shift, shift, 2).tolist()
+    return PointSpread(float(disc_share), float(squeeze), float(rng.uniform(0, math.pi)), (red, blue))
 
 
 def _excess_bounds(shot: Shot, config: SceneConfig) -> tuple[float, float]:
@@ -140,21 +157,32 @@ def draw_layers(
             Layer(
                 torch.from_numpy(color.transpose(2, 0, 1).copy()),
                 torch.from_numpy(alpha)[None],
-                torch.from_numpy(np.abs(excess) * np.float32(shot.k_cam_px)),
+                torch.from_numpy(-excess * np.float32(shot.k_cam_px)),
             )
         )
     return layers, excesses
 
 
-def develop(rng: np.random.Generator, linear: Map, config: SceneConfig) -> NDArray[np.uint8]:
-    """Light on the sensor [h,w,3] to a JPEG's pixels: exposure, noise, white balance, tone, sharpening, JPEG."""
+def _through_mosaic(linear: Map) -> Map:
+    """The picture [h,w,3] as a sensor with one colour a pixel has it, interpolated."""
+    levels = (np.clip(linear, 0, 2) * 32767.5).astype(np.uint16)
+    mosaic = levels[..., 1].copy()
+    mosaic[::2, ::2], mosaic[1::2, 1::2] = levels[::2, ::2, 0], levels[1::2, 1::2, 2]
+    # OpenCV names a mosaic by the pixels of its second row: this one begins red, green
+    return np.asarray(cv2.demosaicing(mosaic, cv2.COLOR_BayerBG2RGB), np.float32) / np.float32(32767.5)
+
+
+def develop(rng: np.random.Generator, linear: Map, config: SceneConfig, *, through_mosaic: bool) -> NDArray[np.uint8]:
+    """Light on the sensor [h,w,3] to a JPEG's pixels: exposure, noise, demosaic, white balance, tone, sharpening."""
     picture = linear * rng.uniform(0.5, 1.4) / max(float(np.quantile(linear, 0.98)), 0.2)
     shot_noise, read_noise = _log_uniform(rng, (1e-6, 3e-4)), _log_uniform(rng, (1e-4, 2e-3))
     noise = rng.standard_normal(picture.shape).astype(np.float32)
     spread = rng.uniform(0, 0.9)
-    if spread > 0.3:  # a demosaic makes noise of neighbours alike
+    if spread > 0.3 and not through_mosaic:  # filters make noise of neighbours alike
         noise = np.asarray(cv2.GaussianBlur(noise, (0, 0), spread)) * np.float32(1 + 1.5 * spread)
     picture = picture + noise * np.sqrt(shot_noise * np.maximum(picture, 0) + read_noise**2)
+    if through_mosaic:
+        picture = _through_mosaic(picture)
     picture = picture * rng.uniform(0.85, 1.15, 3)
     encoded = encode_srgb(picture.astype(np.float32))
     bend = rng.uniform(-0.1, 0.35)
@@ -174,15 +202,41 @@ def draw_sample(seed: int, config: SceneConfig, photographs: list[NDArray[np.uin
     """The scene of this seed: the same seed, config and photographs give the same sample."""
     rng = np.random.default_rng(seed)
     shot = draw_shot(rng, config)
+    if rng.random() >= RESCALED_SHARE:
+        return Sample(*_photograph(rng, shot, config, photographs), shot)
+    ratio = rng.uniform(*RESCALES)
+    size = config.size_px
+    ratio = round(size * ratio) / size
+    larger = replace(
+        config,
+        size_px=round(size * ratio),
+        margin_px=round(config.margin_px * ratio),
+        defocus_px=(config.defocus_px[0] * ratio, config.defocus_px[1] * ratio),
+    )
+    # a pixel of the small picture averages those of the large one: its box is there before it is made small
+    rest = max(shot.gamma_px**2 - PIXEL_BOX_VARIANCE, 0.0)
+    taken = replace(shot, k_cam_px=shot.k_cam_px * ratio, gamma_px=math.sqrt(rest * ratio**2 + PIXEL_BOX_VARIANCE))
+    image, excess = _photograph(rng, taken, larger, photographs)
+    small = cv2.resize(image.transpose(1, 2, 0), (size, size), interpolation=cv2.INTER_AREA)
+    told = cv2.resize(excess.astype(np.float32), (size, size), interpolation=cv2.INTER_NEAREST)
+    pixels = np.ascontiguousarray(np.asarray(small, np.uint8).transpose(2, 0, 1))
+    return Sample(pixels, np.asarray(told, np.float16), shot)
+
+
+def _photograph(
+    rng: np.random.Generator, shot: Shot, config: SceneConfig, photographs: list[NDArray[np.uint8]]
+) -> tuple[NDArray[np.uint8], NDArray[np.float16]]:
+    """Picture uint8 [3,h,w] and q - 1 [h,w] of a random scene taken so."""
     layers, excesses = draw_layers(rng, shot, config, photographs)
-    linear, front = render_layers(layers, shot.disc_share)
+    linear, front = render_layers(layers, shot.spread)
     seen = np.take_along_axis(excesses, front.numpy()[None], 0)[0]
-    rest = math.sqrt(max(shot.gamma_px**2 - PIXEL_BOX_VARIANCE, 0.0))
-    linear = blur(linear, rest)
+    variance = shot.gamma_px**2 - PIXEL_BOX_VARIANCE
+    through_mosaic = variance > MOSAIC_VARIANCE and rng.random() < MOSAIC_SHARE
+    rest = math.sqrt(max(variance - through_mosaic * MOSAIC_VARIANCE, 0.0))
     inner = slice(config.margin_px, config.margin_px + config.size_px)
-    light = np.ascontiguousarray(linear[:, inner, inner].permute(1, 2, 0).numpy())
-    pixels = develop(rng, light, config)
-    return Sample(np.ascontiguousarray(pixels.transpose(2, 0, 1)), seen[inner, inner].astype(np.float16), shot)
+    light = np.ascontiguousarray(blur(linear, rest)[:, inner, inner].permute(1, 2, 0).numpy())
+    pixels = develop(rng, light, config, through_mosaic=through_mosaic)
+    return np.ascontiguousarray(pixels.transpose(2, 0, 1)), seen[inner, inner].astype(np.float16)
 
 
 def true_blur_px(sample: Sample) -> Map:

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from model_export.cases import is_textured
+from model_export.cases import FIXED, fixed_cases, is_textured
 from model_export.config import SceneConfig
+from model_export.evaluate import Examiner, summarise
 from model_export.render import refocus
 from model_export.textures import draw_texture
 from service.config import SHIPPED_MODEL
@@ -95,6 +96,14 @@ def to_pixels(picture: NDArray[np.float32]) -> NDArray[np.uint8]:
 @pytest.fixture(scope="module")
 def estimator() -> Estimator:
     return Estimator.from_folder(load_model_folder(SHIPPED_MODEL), intra_op_threads=1)
+
+
+def test_it_scores_what_its_card_says() -> None:
+    examiner = Examiner(SHIPPED_MODEL)
+    found = summarise(FIXED, "gt", [examiner.answer(case)[0] for case in fixed_cases()])
+    recorded = load_model_folder(SHIPPED_MODEL).manifest.scores
+    assert found.mean.abs_rel == pytest.approx(recorded["fixed.abs_rel"], rel=0.02)
+    assert found.pooled.rmse == pytest.approx(recorded["fixed.rmse_m"], rel=0.02)
 
 
 @pytest.mark.parametrize("seed", [11, 12, 14, 17])

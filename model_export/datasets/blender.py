@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from model_export.render import PIXEL_BOX_VARIANCE, blur, encode_srgb
+from model_export.render import DISC, PIXEL_BOX_VARIANCE, blur, encode_srgb
 from service.optics import thin_lens
 
 BPY = "bpy==5.0.1"
@@ -167,7 +167,7 @@ def compare_edge(scene: Scene, light: Map) -> EdgeResult:
     """Measure a rendered edge [h,w] and ours by the same means."""
     depth_m = scene.depth_m or math.nan
     expected = thin_lens.defocus_at_depth(depth_m, scene.focus_distance_m, scene.k_cam_px)
-    ours = blur(torch.from_numpy(sharp_edge(scene.size_px)), expected, disc_share=1.0).numpy()
+    ours = blur(torch.from_numpy(sharp_edge(scene.size_px)), expected, DISC).numpy()
     return EdgeResult(scene.name, expected, edge_sigma(light, expected), edge_sigma(ours, expected))
 
 

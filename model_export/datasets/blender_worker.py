@@ -115,19 +115,23 @@ def slanted_edge(scene, spec):
 
 
 CONTRASTS = ((0.02, 0.8), (0.8, 0.05), (0.1, 0.4), (0.5, 0.9))
+FEATURE_PX = (3, 40)
 PATTERNS = (
-    ("ShaderNodeTexNoise", {"Scale": (6, 80), "Detail": (2, 10), "Roughness": (0.4, 0.8)}),
-    ("ShaderNodeTexVoronoi", {"Scale": (8, 80)}),
-    ("ShaderNodeTexBrick", {"Scale": (6, 40)}),
-    ("ShaderNodeTexChecker", {"Scale": (6, 60)}),
-    ("ShaderNodeTexWave", {"Scale": (2, 20), "Distortion": (0, 8), "Detail": (0, 6)}),
-    ("ShaderNodeTexMagic", {"Scale": (2, 15), "Distortion": (0.5, 3)}),
+    ("ShaderNodeTexNoise", {"Detail": (2, 10), "Roughness": (0.5, 0.8)}),
+    ("ShaderNodeTexVoronoi", {}),
+    ("ShaderNodeTexBrick", {}),
+    ("ShaderNodeTexChecker", {}),
+    ("ShaderNodeTexWave", {"Distortion": (0, 8), "Detail": (0, 6)}),
+    ("ShaderNodeTexMagic", {"Distortion": (0.5, 3)}),
 )
 
 
-def painted(dice, number):
-    """A matt or glossy material with a pattern of Blender's own between two colours; one in six is plain."""
-    made, nodes, links = material(f"paint{number}")
+def painted(dice, name, unit_px):
+    """A matt or glossy material with a pattern of Blender's own between two colours; one in eight is plain.
+
+    ``unit_px`` is how large a unit of the object's own coordinates appears.
+    """
+    made, nodes, links = material(f"paint {name}")
     surface, out = nodes.new("ShaderNodeBsdfPrincipled"), nodes.new("ShaderNodeOutputMaterial")
     links.new(surface.outputs[0], out.inputs["Surface"])
     surface.inputs["Roughness"].default_value = dice.uniform(0.3, 1)
@@ -136,14 +140,18 @@ def painted(dice, number):
     if dice.random() < 1 / 8:
         return made
     kind, ranges = dice.choice(PATTERNS)
-    pattern, place, mix = nodes.new(kind), nodes.new("ShaderNodeTexCoord"), nodes.new("ShaderNodeValToRGB")
-    for name, (low, high) in ranges.items():
-        pattern.inputs[name].default_value = dice.uniform(low, high)
+    pattern, place, ramp = nodes.new(kind), nodes.new("ShaderNodeTexCoord"), nodes.new("ShaderNodeValToRGB")
+    feature_px = math.exp(dice.uniform(*map(math.log, FEATURE_PX)))
+    pattern.inputs["Scale"].default_value = unit_px / feature_px
+    for option, (low, high) in ranges.items():
+        pattern.inputs[option].default_value = dice.uniform(low, high)
     links.new(place.outputs["Object"], pattern.inputs["Vector"])
     value = next(o for o in pattern.outputs if o.name in ("Fac", "Factor", "Distance") and o.enabled)
-    links.new(value, mix.inputs[0])
-    mix.color_ramp.elements[0].color, mix.color_ramp.elements[1].color = colors
-    links.new(mix.outputs["Color"], surface.inputs["Base Color"])
+    links.new(value, ramp.inputs[0])
+    low, high = ramp.color_ramp.elements
+    low.color, high.color = colors
+    low.position, high.position = 0.3, 0.7
+    links.new(ramp.outputs["Color"], surface.inputs["Base Color"])
     return made
 
 
@@ -164,14 +172,15 @@ def room(scene, spec):
     span = spec["sensor_width_mm"] / spec["focal_length_mm"]
     wall = focus * dice.uniform(1.2, 4)
     low = -dice.uniform(0.2, 0.45) * focus * span
+    fx_px = spec["size_px"] / span
     bpy.ops.mesh.primitive_plane_add(
         size=40 * wall, location=(0, 0, -wall), rotation=(dice.uniform(-0.3, 0.3), dice.uniform(-0.5, 0.5), 0)
     )
-    bpy.context.object.data.materials.append(painted(dice, "wall"))
+    bpy.context.object.data.materials.append(painted(dice, "wall", fx_px / wall))
     bpy.ops.mesh.primitive_plane_add(
         size=40 * wall, location=(0, low, 0), rotation=(math.pi / 2 + dice.uniform(-0.1, 0.1), 0, 0)
     )
-    bpy.context.object.data.materials.append(painted(dice, "floor"))
+    bpy.context.object.data.materials.append(painted(dice, "floor", fx_px / focus))
     for number in range(dice.randint(3, 14)):
         depth = focus / dice.uniform(1 / 2.5, 2.2)
         size = depth * span * dice.uniform(0.06, 0.3)
@@ -180,7 +189,7 @@ def room(scene, spec):
         solid.location = (dice.uniform(-0.5, 0.5) * depth * span, dice.uniform(-0.4, 0.4) * depth * span, -depth)
         solid.rotation_euler = [dice.uniform(0, 6.3) for _ in range(3)]
         solid.scale = (size, size, size * dice.uniform(0.5, 1.5))
-        solid.data.materials.append(painted(dice, number))
+        solid.data.materials.append(painted(dice, number, size * fx_px / depth))
         if hasattr(solid.data, "shade_smooth"):
             solid.data.shade_smooth()
     for number in range(dice.randint(1, 3)):

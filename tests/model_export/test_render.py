@@ -8,7 +8,10 @@ import torch
 from numpy.typing import NDArray
 
 from model_export.render import (
+    DISC,
+    GAUSSIAN,
     Layer,
+    PointSpread,
     blur,
     blur_levels,
     blur_varying,
@@ -47,10 +50,36 @@ def test_a_constant_image_stays_constant(depth: Map, shade: float) -> None:
 def test_a_point_keeps_its_energy_and_gets_the_standard_deviation_asked_for(disc_share: float, sigma: float) -> None:
     point = torch.zeros(1, 129, 129)
     point[0, 64, 64] = 1
-    spread = blur(point, sigma, disc_share)[0].double()
+    spread = blur(point, sigma, PointSpread(disc_share))[0].double()
     offsets = torch.arange(-64, 65).double()
     assert float(spread.sum()) == pytest.approx(1, abs=1e-5)
     assert float((spread.sum(0) * offsets**2).sum()) == pytest.approx(sigma**2, rel=0.02)
+
+
+def test_a_squeezed_disc_keeps_its_mean_variance_and_is_longer_one_way() -> None:
+    point = torch.zeros(1, 129, 129)
+    point[0, 64, 64] = 1
+    seen = blur(point, 6.0, PointSpread(1.0, squeeze=0.7, angle=math.pi / 2))[0].double()
+    offsets = torch.arange(-64, 65).double()
+    across, along = (float((seen.sum(axis) * offsets**2).sum()) for axis in (0, 1))
+    assert (along + across) / 2 == pytest.approx(36, rel=0.02)
+    assert across / along == pytest.approx(0.49, rel=0.05)
+
+
+def test_colours_focused_elsewhere_are_blurred_otherwise_nearer_and_farther() -> None:
+    size = 96
+    white = torch.zeros(3, size, size)
+    white[:, size // 2, size // 2] = 1
+    spreads = PointSpread(0.0, chromatic_px=(1.0, -1.0))
+    peaks = []
+    for signed_px in (-3.0, 3.0):
+        layer = Layer(white, torch.ones(1, size, size), torch.full((size, size), signed_px))
+        picture, front = render_layers([layer], spreads)
+        assert picture.sum((1, 2)).tolist() == pytest.approx([1, 1, 1], rel=1e-4)
+        assert (front == 0).all()
+        peaks.append((1 / (2 * math.pi * picture.amax((1, 2)))).sqrt().tolist())
+    assert peaks[0] == pytest.approx([2, 3, 4], rel=0.05)
+    assert peaks[1] == pytest.approx([4, 3, 2], rel=0.05)
 
 
 def test_energy_is_kept_on_a_slanted_surface() -> None:
@@ -105,7 +134,7 @@ def test_two_levels_of_blur_pass_for_the_one_between() -> None:
     middle = (levels[0] + levels[1]) / 2
     sigma = torch.full((128, 128), middle)
     sigma[0, 0], sigma[0, 1] = 2.0, 4.0
-    mixed, exact = blur_varying(point, sigma, 0.0)[0], blur(point, middle, 0.0)[0]
+    mixed, exact = blur_varying(point, sigma, GAUSSIAN)[0], blur(point, middle)[0]
     offsets = torch.arange(-64, 64)
     assert float((mixed.sum(0) * offsets**2).sum()) == pytest.approx(middle**2, rel=5e-3)
     assert float((mixed - exact).abs().max()) < 0.08 * float(exact.max())
@@ -119,7 +148,7 @@ def test_a_scene_of_one_shade_stays_that_shade_through_all_its_layers() -> None:
     near = torch.full((size, size), 5.0)
     layers = [Layer(shade * alpha.repeat(3, 1, 1), alpha, near)]
     layers.append(Layer(torch.full((3, size, size), shade), torch.ones(1, size, size), far))
-    picture, _ = render_layers(layers, 1.0)
+    picture, _ = render_layers(layers, DISC)
     np.testing.assert_allclose(picture.numpy(), shade, atol=1e-4)
 
 
@@ -131,7 +160,7 @@ def test_a_pixel_belongs_to_the_layer_most_of_its_light_is_from() -> None:
     behind = Layer(torch.zeros(3, size, size), torch.ones(1, size, size), torch.full((size, size), 0.5))
     for blur_px, shown in ((1.0, True), (16.0, False)):
         bar = Layer(alpha.repeat(3, 1, 1), alpha, torch.full((size, size), blur_px))
-        _, front = render_layers([bar, behind], 0.0)
+        _, front = render_layers([bar, behind], GAUSSIAN)
         assert (front[:, 46:50] == (0 if shown else 1)).all()
         assert (front[:, :36] == 1).all()
 

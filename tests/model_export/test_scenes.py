@@ -38,4 +38,4 @@ def test_a_scene_keeps_to_its_ranges(seed: int) -> None:
 def test_all_sides_and_lens_shapes_turn_up() -> None:
     shots = [draw_sample(seed, SceneConfig(size_px=32, margin_px=8), []).shot for seed in range(60)]
     assert {shot.side for shot in shots} == {-1, 0, 1}
-    assert {0.0, 1.0} < {shot.disc_share for shot in shots}
+    assert {0.0, 1.0} < {shot.spread.disc_share for shot in shots}
