@@ -20,6 +20,8 @@ from service.optics import thin_lens
 SIDES = ("near", "far", "both")
 SIDE_SHARES = (0.45, 0.2, 0.35)
 LAYERED_SHARE = 0.7
+NEAREST_AT_MOST, FARTHEST_AT_LEAST = 0.6, 1.5
+CLOSE_SHARE = 0.5
 K_CAM_LEAN = 0.6  # cameras with little blur need fewer examples than those with much
 ROUND_SHARE = 0.7
 CHROMATIC_SHARE = 0.4
@@ -34,7 +36,10 @@ Map = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """The camera and lens of one scene; ``side`` is -1 if all is nearer than focus, +1 if beyond, 0 if both."""
+    """The camera and lens of one scene, and how near and far its surfaces may be, as z / s1.
+
+    ``side`` is -1 if all is nearer than focus, +1 if beyond, 0 if both.
+    """
 
     k_cam_px: float
     gamma_px: float
@@ -42,6 +47,7 @@ class Shot:
     focal_length_px: float
     spread: PointSpread
     side: int
+    depth_ratio: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +76,10 @@ def draw_shot(rng: np.random.Generator, config: SceneConfig) -> Shot:
         focal_length_px=_log_uniform(rng, config.focal_length_px),
         spread=_draw_spread(rng, k_cam_px),
         side=(-1, 1, 0)[side],
+        depth_ratio=(
+            _log_uniform(rng, (config.depth_ratio[0], NEAREST_AT_MOST)),
+            _log_uniform(rng, (FARTHEST_AT_LEAST, config.depth_ratio[1])),
+        ),
     )
 
 
@@ -86,8 +96,8 @@ def _draw_spread(rng: np.random.Generator, k_cam_px: float) -> PointSpread:
 def _excess_bounds(shot: Shot, config: SceneConfig) -> tuple[float, float]:
     """Lowest and highest q - 1 that the depth range and the largest blur allow."""
     limit = config.defocus_px[1] / shot.k_cam_px
-    nearest = min(1 / config.depth_ratio[0] - 1, limit)
-    farthest = min(1 - 1 / config.depth_ratio[1], limit)
+    nearest = min(1 / shot.depth_ratio[0] - 1, limit)
+    farthest = min(1 - 1 / shot.depth_ratio[1], limit)
     return (0.0 if shot.side < 0 else -farthest), (0.0 if shot.side > 0 else nearest)
 
 
@@ -147,7 +157,9 @@ def draw_layers(
     size = config.size_px + 2 * config.margin_px
     bounds = _excess_bounds(shot, config)
     count = int(rng.integers(1, config.max_layers + 1)) if rng.random() < LAYERED_SHARE else 1
-    middles = sorted((_draw_excess(rng, shot, config) for _ in range(count)), reverse=True)
+    first, *others = (_draw_excess(rng, shot, config) for _ in range(count))
+    apart = rng.uniform(0, 1) if rng.random() < CLOSE_SHARE else 1.0  # what stands together is often alike in depth
+    middles = sorted((first, *(first + apart * (other - first) for other in others)), reverse=True)
     layers: list[Layer] = []
     excesses = np.stack([_surface(rng, middle, bounds, size) for middle in middles])
     for i, excess in enumerate(excesses):
