@@ -8,7 +8,7 @@ from importlib.metadata import version
 from fastapi import FastAPI
 from fastapi_offline import FastAPIOffline
 
-from service.api import cameras, depth, handlers, health, metrics, model, openapi, pages
+from service.api import cameras, depth, handlers, health, metrics, model, openapi, pages, target
 from service.config import Settings
 from service.inference.artifact import load_model_folder
 from service.inference.estimator import Estimator
@@ -27,6 +27,7 @@ Every error is `application/problem+json`.
 TAGS = [
     {"name": "cameras", "description": "What turns blur into metres"},
     {"name": "depth", "description": "Photographs to depth maps"},
+    {"name": "calibration", "description": "A camera's constants from a sheet of paper"},
     {"name": "service", "description": "The model, health and metrics"},
 ]
 
@@ -48,7 +49,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.metrics = metrics.Metrics()
     _add_middleware(app, settings)
     handlers.install(app)
-    for part in (cameras, depth, model, health, metrics, pages):
+    for part in (cameras, depth, target, model, health, metrics, pages):
         app.include_router(part.router)
     app.openapi = lambda: openapi.describe(app)  # type: ignore[method-assign]
     return app

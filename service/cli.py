@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import EntryPoint, entry_points, version
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 from sqlalchemy import Engine
@@ -79,6 +79,33 @@ def openapi() -> None:
     from service.app import create_app
 
     typer.echo(to_yaml(create_app(_settings()).openapi()), nl=False)
+
+
+@app.command()
+def target(
+    out: Annotated[Path, typer.Option(help="File to write: .pdf or .svg", dir_okay=False)] = Path("target.pdf"),
+    kind: Literal["asymmetric_circles", "symmetric_circles"] = "asymmetric_circles",
+    rows: Annotated[int, typer.Option(min=2, max=40)] = 11,
+    columns: Annotated[int, typer.Option(min=2, max=40)] = 4,
+    spacing_mm: Annotated[float, typer.Option(help="The spacing s of the grid")] = 20.0,
+    diameter_mm: Annotated[float, typer.Option(help="Of each circle")] = 12.0,
+    paper: Literal["a4", "letter"] = "a4",
+) -> None:
+    """Write the sheet of circles that a calibration photographs."""
+    from service.calibration.target import WRITERS, CircleGrid, lay_out
+
+    write = WRITERS.get(out.suffix.lower())
+    if write is None:
+        raise _failure(f"--out must end in {' or '.join(WRITERS)}, not {out.suffix or 'nothing'}", WRONG_USE)
+    try:
+        sheet = lay_out(CircleGrid(kind, rows, columns, spacing_mm, diameter_mm), paper)
+    except ValueError as exc:
+        raise _failure(str(exc), WRONG_USE) from exc
+    try:
+        out.write_bytes(write(sheet))
+    except OSError as exc:
+        raise _failure(str(exc)) from exc
+    typer.echo(out)
 
 
 @app.command(name="version")

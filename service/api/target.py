@@ -1,0 +1,57 @@
+"""``GET /calibrate/target.svg|pdf``: the sheet to print."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Query, Response
+
+from service.api.problems import responses
+from service.calibration.target import CircleGrid, Kind, Paper, Sheet, as_pdf, as_svg, lay_out
+from service.errors import BadRequest, FieldProblem
+
+MOST_CIRCLES = 40
+
+router = APIRouter(prefix="/calibrate", tags=["calibration"])
+
+Circles = Annotated[int, Query(ge=2, le=MOST_CIRCLES)]
+Millimetres = Annotated[float, Query(gt=0, le=1000, allow_inf_nan=False)]
+
+
+def _sheet(
+    kind: Annotated[Kind, Query(description="How the circles stand")] = "asymmetric_circles",
+    rows: Circles = 11,
+    columns: Circles = 4,
+    spacing_mm: Millimetres = 20.0,
+    diameter_mm: Millimetres = 12.0,
+    paper: Annotated[Paper, Query(description="The sheet")] = "a4",
+) -> Sheet:
+    try:
+        return lay_out(CircleGrid(kind, rows, columns, spacing_mm, diameter_mm), paper)
+    except ValueError as exc:
+        raise BadRequest(str(exc), errors=(FieldProblem("spacing_mm", str(exc)),)) from exc
+
+
+SheetDep = Annotated[Sheet, Depends(_sheet)]
+
+
+@router.get(
+    "/target.svg",
+    operation_id="readTargetSvg",
+    summary="The sheet to print, as SVG",
+    response_class=Response,
+    responses={200: {"content": {"image/svg+xml": {}}}, **responses(BadRequest)},
+)
+def read_target_svg(sheet: SheetDep) -> Response:
+    """A grid of circles in true millimetres, with a ruler to check the print."""
+    return Response(as_svg(sheet), media_type="image/svg+xml")
+
+
+@router.get(
+    "/target.pdf",
+    operation_id="readTargetPdf",
+    summary="The sheet to print, as PDF",
+    response_class=Response,
+    responses={200: {"content": {"application/pdf": {}}}, **responses(BadRequest)},
+)
+def read_target_pdf(sheet: SheetDep) -> Response:
+    """A grid of circles in true millimetres, with a ruler to check the print."""
+    return Response(as_pdf(sheet), media_type="application/pdf")
