@@ -5,8 +5,10 @@ is one run, however fast the scene workers are and however often it is stopped.
 """
 
 import os
+import time
 from collections import deque
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -242,6 +244,24 @@ class Trainer:
         return Checkpoint(self.config, self.step, self.modules.state_dict(), self.optimizer.state_dict())
 
 
+class Pace:
+    """How fast steps go, and what part of the time they wait for scenes: a starved run says so."""
+
+    def __init__(self) -> None:
+        self.started = time.perf_counter()
+        self.waited_s = 0.0
+
+    @contextmanager
+    def waiting(self) -> Iterator[None]:
+        began = time.perf_counter()
+        yield
+        self.waited_s += time.perf_counter() - began
+
+    def told(self, steps: int, scenes_per_step: int) -> str:
+        spent_s = time.perf_counter() - self.started
+        return f"{steps * scenes_per_step / spent_s:.2f} scenes/s, waited {self.waited_s / spent_s:.0%}"
+
+
 def train(
     config: TrainConfig,
     textures: Path,
@@ -265,15 +285,20 @@ def train(
             pass
         task = progress.add_task("training", total=config.steps, completed=trainer.step)
         recent: deque[dict[str, float]] = deque(maxlen=config.checkpoint_every)
+        pace = Pace()
         while trainer.step < config.steps:
             if trainer.step == settling_step(config):
                 trainer.settle(pool.batch(config.steps + i) for i in range(config.settle_batches))
             recent.append(trainer.advance(pool.batch(trainer.step)))
-            pool.refresh()
+            with pace.waiting():
+                pool.refresh()
             progress.update(task, completed=trainer.step)
             if trainer.step % config.checkpoint_every == 0 or trainer.step == config.steps:
                 trainer.checkpoint().save(path)
-                console.print(_report(trainer.step, recent, trainer.validate(test)))
+                spent = pace.told(len(recent), config.fresh_per_step)
+                console.print(f"{_report(trainer.step, recent, trainer.validate(test))}  {spent}")
+                recent.clear()
+                pace = Pace()
     return path
 
 

@@ -51,6 +51,7 @@ def test_a_run_reports_and_ends_in_a_checkpoint(textures: Path, tmp_path: Path) 
     assert checkpoint.config == CONFIG
     assert "step 3: loss" in said
     assert "held out" in said
+    assert "scenes/s, waited" in said
 
 
 def test_a_stopped_run_goes_on_as_if_it_had_not_been_stopped(textures: Path, tmp_path: Path) -> None:
