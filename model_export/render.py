@@ -9,6 +9,7 @@ the transfer function of the point spread, so discs of any diameter cost the sam
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -24,6 +25,8 @@ LEVEL_OFFSET_PX = 0.5
 MARGIN_SIGMAS = 3.0
 PIXEL_BOX_VARIANCE = 1.0 / 12.0
 SOFT_EDGE_VARIANCE = 0.25
+SAMPLED_BELOW_VARIANCE = 0.8
+SAMPLED_TAPS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,18 +58,39 @@ class Layer:
     defocus_px: Tensor
 
 
+@lru_cache(maxsize=256)
+def _taps(variance: float) -> tuple[float, ...]:
+    """Weights at 1, 2, ... px, before normalising, of the sampled Gaussian that has this variance."""
+    low, high = 1e-3, 2 * SAMPLED_BELOW_VARIANCE  # sampling narrows: look for the parameter that makes up for it
+    for _ in range(40):
+        parameter = (low + high) / 2
+        weights = [math.exp(-(x**2) / (2 * parameter)) for x in range(1, SAMPLED_TAPS + 1)]
+        found = 2 * sum(w * x**2 for x, w in enumerate(weights, 1)) / (1 + 2 * sum(weights))
+        low, high = (parameter, high) if found < variance else (low, parameter)
+    return tuple(weights)
+
+
+def _gaussian_transfer(frequency: Tensor, variance: float) -> Tensor:
+    """Transfer function of a Gaussian along one axis, at cycles per pixel."""
+    if variance >= SAMPLED_BELOW_VARIANCE:
+        return torch.exp(-2 * math.pi**2 * variance * frequency**2)
+    out = torch.ones_like(frequency)
+    for x, weight in enumerate(_taps(variance), 1):
+        out = out + 2 * weight * torch.cos(2 * math.pi * x * frequency)
+    return out / (1 + 2 * sum(_taps(variance)))
+
+
 def transfer(height: int, width: int, sigma_px: float, spread: PointSpread) -> Tensor:
     """Transfer function [h, w//2+1] of a point spread with standard deviation ``sigma_px`` per axis.
 
-    The Gaussian is the discrete one (Lindeberg 1990, exp(s^2 (cos w - 1)) per axis): positive and of exact variance
-    at any sigma, where a sampled or band-limited one of half a pixel rings.
+    The Gaussian is a sampled one: positive and of exact variance at any sigma, where a band-limited one of half a
+    pixel rings.
     """
     fy = torch.fft.fftfreq(height)[:, None]
     fx = torch.fft.rfftfreq(width)[None, :]
     variance = sigma_px**2
     gauss_variance = max((1 - spread.disc_share) * variance, min(variance, SOFT_EDGE_VARIANCE))
-    falling = torch.cos(2 * math.pi * fy) + torch.cos(2 * math.pi * fx) - 2
-    gauss = torch.exp(gauss_variance * falling)
+    gauss = _gaussian_transfer(fy, gauss_variance) * _gaussian_transfer(fx, gauss_variance)
     if gauss_variance >= variance:
         return gauss
     longer_px = 2 * math.sqrt((variance - gauss_variance) * 2 / (1 + spread.squeeze**2))

@@ -1,0 +1,94 @@
+"""Blur of a printed circle, where the blur is known."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from model_export.render import DISC, GAUSSIAN, PointSpread, blur
+from service.calibration.edge import EdgeError, fit_edge
+
+SIZE = 128
+FINE = 8
+
+
+def circle(
+    radius: float = 24.0, x: float = 63.3, y: float = 64.8, *, axes_ratio: float = 1.0, turn: float = 0.0
+) -> NDArray[np.float32]:
+    """White paper [h,w] with a black ellipse, each pixel the mean over its square."""
+    at = (np.arange(SIZE * FINE) + 0.5) / FINE - 0.5
+    u, v = at[None, :] - x, at[:, None] - y
+    along, across = u * math.cos(turn) + v * math.sin(turn), v * math.cos(turn) - u * math.sin(turn)
+    fine = 0.9 - 0.85 * ((along / radius) ** 2 + (across / (radius * axes_ratio)) ** 2 < 1)
+    return np.asarray(fine.reshape(SIZE, FINE, SIZE, FINE).mean((1, 3)), np.float32)
+
+
+def photographed(
+    sharp: NDArray[np.float32], sigma: float, spread: PointSpread, noise: float = 0.0
+) -> NDArray[np.float32]:
+    rng = np.random.default_rng(1)
+    light = blur(torch.from_numpy(sharp), sigma, spread).numpy()
+    return np.asarray(light + noise * rng.standard_normal(light.shape), np.float32)
+
+
+@pytest.mark.parametrize("spread", [GAUSSIAN, DISC], ids=["gaussian", "disc"])
+@pytest.mark.parametrize("sigma", [2.0, 4.0, 8.0])
+def test_blur_is_found_to_a_percent(sigma: float, spread: PointSpread) -> None:
+    total = math.sqrt(sigma**2 + 1 / 12)
+    found = fit_edge(photographed(circle(), sigma, spread), 64, 64, 23)
+    assert found.blur_px == pytest.approx(total, rel=0.015)
+    assert (found.x_px, found.y_px) == pytest.approx((63.3, 64.8), abs=0.02)
+    assert found.radius_px == pytest.approx(24, rel=0.01)
+    assert found.shape == ("disc" if spread is DISC else "gaussian")
+
+
+@pytest.mark.parametrize("sigma", [0.7, 1.0, 1.5])
+def test_small_blur_is_found_under_a_gaussian_and_a_little_high_under_a_disc(sigma: float) -> None:
+    """Both shapes look alike there; eight in a hundred at most is what the wrong one costs."""
+    total = math.sqrt(sigma**2 + 1 / 12)
+    assert fit_edge(photographed(circle(), sigma, GAUSSIAN), 64, 64, 23).blur_px == pytest.approx(total, rel=0.015)
+    disc = fit_edge(photographed(circle(), sigma, DISC), 64, 64, 23)
+    assert disc.blur_px == pytest.approx(total, rel=0.08)
+
+
+def test_noise_shows_in_the_error_that_is_stated() -> None:
+    sharp = circle()
+    errors, stated = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        light = photographed(sharp, 3.0, GAUSSIAN) + 0.02 * rng.standard_normal((SIZE, SIZE)).astype(np.float32)
+        found = fit_edge(light.astype(np.float32), 64, 64, 24)
+        errors.append(found.blur_px - math.sqrt(9 + 1 / 12))
+        stated.append(found.blur_error_px)
+    assert np.abs(np.mean(errors)) < 0.03
+    assert 0.4 < np.std(errors) / np.mean(stated) < 2.5
+
+
+def test_a_tilted_circle_under_uneven_light_is_read_alike() -> None:
+    light = photographed(circle(axes_ratio=0.88, turn=0.5), 3.0, GAUSSIAN)
+    shade = (
+        np.linspace(0.7, 1.2, SIZE, dtype=np.float32)[None, :] * np.linspace(1.1, 0.9, SIZE, dtype=np.float32)[:, None]
+    )
+    found = fit_edge((light * shade).astype(np.float32), 64, 64, 23)
+    assert found.blur_px == pytest.approx(math.sqrt(9 + 1 / 12), rel=0.02)
+    assert found.semi_axes_px == pytest.approx((24, 24 * 0.88), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("light", "place", "why"),
+    [
+        (circle(), (10, 64, 24), "border"),
+        (circle(), (64, 64, 3), "too small"),
+        (np.full((SIZE, SIZE), 0.8, np.float32), (64, 64, 24), "faint"),
+        (np.zeros((SIZE, SIZE), np.float32), (64, 64, 24), "no light"),
+        (np.random.default_rng(0).random((SIZE, SIZE)).astype(np.float32), (64, 64, 24), "does not look"),
+        (circle(radius=11), (64, 64, 24), "not the circle"),
+    ],
+)
+def test_what_cannot_be_measured_is_said(
+    light: NDArray[np.float32], place: tuple[float, float, float], why: str
+) -> None:
+    with pytest.raises(EdgeError, match=why):
+        fit_edge(light, *place)
