@@ -1,0 +1,79 @@
+"""The joint fit, on circles whose camera is known."""
+
+import numpy as np
+import pytest
+
+from service.calibration.fit import Circles, FitError, fit_constants
+from service.optics import thin_lens
+
+K_CAM, GAMMA, FOCUS = 6.0, 0.7, 1.2
+BOTH_SIDES = (0.6, 0.75, 0.9, 1.1, 1.4, 1.8, 2.4)
+
+
+def circles(depths_m: tuple[float, ...], *, error: float = 0.02, seed: int = 0, per_picture: int = 20) -> Circles:
+    """Pictures of a tilted board about each depth; errors of a picture are partly its own, as in life."""
+    rng = np.random.default_rng(seed)
+    picture = np.repeat(np.arange(len(depths_m)), per_picture)
+    depth = np.repeat(depths_m, per_picture) * (1 + rng.uniform(-0.05, 0.05, picture.size))
+    blur = thin_lens.blur_at_depth(depth, FOCUS, K_CAM, GAMMA)
+    shared = rng.standard_normal(len(depths_m))[picture]
+    noise = error * (0.7 * rng.standard_normal(picture.size) + 0.7 * shared)
+    return Circles(depth, blur * (1 + noise), np.full(picture.size, 0.02), picture)
+
+
+def test_both_sides_of_focus_give_all_three() -> None:
+    found = fit_constants(circles(BOTH_SIDES), resamples=40)
+    assert found.k_cam_px.value == pytest.approx(K_CAM, rel=0.03)
+    assert found.gamma_px.value == pytest.approx(GAMMA, abs=0.08)
+    assert found.focus_distance_m.value == pytest.approx(FOCUS, rel=0.02)
+    assert not found.warnings
+    for interval in (found.k_cam_px, found.gamma_px, found.focus_distance_m):
+        assert interval.low <= interval.value <= interval.high
+
+
+def test_exact_circles_are_fitted_exactly() -> None:
+    found = fit_constants(circles(BOTH_SIDES, error=0.0), resamples=5)
+    assert found.k_cam_px.value == pytest.approx(K_CAM, rel=1e-4)
+    assert found.rms_px < 1e-3
+
+
+def test_the_intervals_hold() -> None:
+    held = 0
+    for seed in range(20):
+        found = fit_constants(circles(BOTH_SIDES, seed=seed, per_picture=6), FOCUS, resamples=40)
+        held += found.k_cam_px.low <= K_CAM <= found.k_cam_px.high
+    assert held >= 17
+
+
+def test_a_few_wrong_circles_are_shown_and_move_little() -> None:
+    some = circles(BOTH_SIDES)
+    blur = some.blur_px.copy()
+    blur[::25] *= 2.5
+    wrong = Circles(some.depth_m, blur, some.blur_error_px, some.picture)
+    found = fit_constants(wrong, resamples=20)
+    assert found.k_cam_px.value == pytest.approx(K_CAM, rel=0.05)
+    assert found.is_outlier[::25].mean() > 0.8
+    assert np.delete(found.is_outlier, np.s_[::25]).mean() < 0.05
+
+
+def test_one_side_is_said_and_stated_wide() -> None:
+    near = (0.5, 0.55, 0.6, 0.65, 0.7)
+    free = fit_constants(circles(near), resamples=40)
+    given = fit_constants(circles(near), FOCUS, resamples=40)
+    assert any("both sides" in warning for warning in free.warnings)
+    assert free.k_cam_px.relative_width > 2 * given.k_cam_px.relative_width
+    assert free.k_cam_px.low < K_CAM < free.k_cam_px.high
+    assert given.k_cam_px.value == pytest.approx(K_CAM, rel=0.05)
+    assert given.focus_distance_m.low == given.focus_distance_m.high == pytest.approx(FOCUS)
+
+
+def test_pictures_all_in_focus_are_said() -> None:
+    found = fit_constants(circles((1.18, 1.2, 1.22)), FOCUS, resamples=10)
+    assert any("no circle is blurred" in warning for warning in found.warnings)
+
+
+def test_too_few_circles_are_an_error_and_one_picture_a_warning() -> None:
+    with pytest.raises(FitError, match="3 circles"):
+        fit_constants(circles((0.6,), per_picture=3))
+    one = fit_constants(circles((0.6,)), FOCUS, resamples=20)
+    assert any("fewer than three" in warning for warning in one.warnings)
