@@ -86,7 +86,7 @@ def draw_shot(rng: np.random.Generator, config: SceneConfig) -> Shot:
 def _draw_spread(rng: np.random.Generator, k_cam_px: float) -> PointSpread:
     """A Gaussian, a disc or between; sometimes squeezed; sometimes red and blue focused elsewhere than green."""
     shape = rng.random()
-    disc_share = 0.0 if shape < 0.15 else 1.0 if shape > 0.4 else rng.uniform(0.3, 1.0)
+    disc_share = 0.0 if shape < 0.25 else 1.0 if shape > 0.65 else rng.uniform(0.3, 1.0)
     squeeze = 1.0 if rng.random() < ROUND_SHARE else rng.uniform(0.7, 1.0)
     shift = min(CHROMATIC_PX, CHROMATIC_PART * k_cam_px) if rng.random() < CHROMATIC_SHARE else 0.0
     red, blue = rng.uniform(-shift, shift, 2).tolist()
@@ -203,7 +203,7 @@ def develop(rng: np.random.Generator, linear: Map, config: SceneConfig, *, throu
         soft = cv2.GaussianBlur(encoded, (0, 0), rng.uniform(0.7, 1.5))
         encoded = encoded + rng.uniform(0.1, 0.5) * (encoded - soft)
     pixels = (np.clip(encoded, 0, 1) * 255 + 0.5).astype(np.uint8)
-    if rng.random() < 0.35:
+    if rng.random() < 0.2:
         return pixels
     quality = int(rng.integers(config.jpeg_quality[0], config.jpeg_quality[1] + 1))
     packed = cv2.imencode(".jpg", pixels[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
