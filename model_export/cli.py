@@ -45,7 +45,7 @@ def train(
     run: Annotated[Path, typer.Option(help="folder of the run: its checkpoint lies there and is gone on from")],
     textures: Textures,
     kind: Kind = "compact",
-    steps: Annotated[int, typer.Option(min=1, help="batches in the whole run")] = 6_950,
+    steps: Annotated[int, typer.Option(min=1, help="batches in the whole run")] = 12_000,
     seed: Annotated[int, typer.Option(min=0, help="the same seed is the same run")] = 1,
     workers: Annotated[int, typer.Option(min=0, max=64, help="processes that draw scenes")] = 1,
     device: Annotated[str, typer.Option(help="torch device")] = "cpu",

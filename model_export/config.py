@@ -32,7 +32,7 @@ class TrainConfig:
 
     kind: Kind = "compact"
     seed: int = 1
-    steps: int = 6_950
+    steps: int = 12_000
     batch: int = 8
     learning_rate: float = 1e-3
     weight_decay: float = 1e-4
