@@ -21,7 +21,7 @@ from service.inference.pair import Side
 from service.optics import thin_lens
 from service.optics.camera import Camera, Intrinsics, Lens
 
-REFERENCE = Camera(640, 480, 2.0, 3.81, 0.5, intrinsics=Intrinsics(525.0, 525.0, 319.5, 239.5))
+FRAME_FX_PX = 525.0
 UNSEEN_K_CAM_PX = (2.64, 3.81, 6.80, 10.7)
 PLANES_M = (0.7, 1.0, 1.5)
 VIEWS = (0.6, 0.8)
@@ -40,6 +40,13 @@ FIXED_SCENES = 6
 PROCEDURAL_SIDES = {"near": -1, "far": 1, "mixed": 0}
 
 Map = NDArray[np.float32]
+
+
+def _centred(fx_px: float, width_px: int, height_px: int) -> Intrinsics:
+    return Intrinsics(fx_px, fx_px, (width_px - 1) / 2, (height_px - 1) / 2)
+
+
+REFERENCE = Camera(640, 480, 2.0, 3.81, 0.5, intrinsics=_centred(FRAME_FX_PX, 640, 480))
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,9 +132,7 @@ def narrowed_cases(folder: Path, count: int, view: float) -> Iterator[Case]:
         cut = (slice(top, height - top), slice(left, width - left))
         picture = cv2.resize(_encoded(photo)[cut], (width, height), interpolation=cv2.INTER_CUBIC)
         depth = cv2.resize(photo.depth_m[cut], (width, height), interpolation=cv2.INTER_NEAREST)
-        fx_px = 525.0 / view
-        inner = Intrinsics(fx_px, fx_px, (width - 1) / 2, (height - 1) / 2)
-        camera = replace(REFERENCE, intrinsics=inner)
+        camera = replace(REFERENCE, intrinsics=_centred(FRAME_FX_PX / view, width, height))
         depth_m = np.asarray(depth, np.float32)
         blurred = refocus(np.clip(np.asarray(picture, np.float32), 0, 1), filled(depth_m), camera)
         yield Case(photo.name, to_pixels(blurred), _to_limit(depth_m), camera, "near")
@@ -137,9 +142,7 @@ def d200_cases(folder: Path, count: int) -> Iterator[Case]:
     """Real photographs of a real lens, known by its specs alone; scored away from depth steps and to 5 m."""
     for photo in _spread(folder, count):
         height, width = photo.image.shape[:2]
-        fx = D200.fx_px(width)
-        inner = Intrinsics(fx, fx, (width - 1) / 2, (height - 1) / 2)
-        camera = Camera(width, height, 2.0, D200.k_cam_px(2.0, width), 0.5, D200.focal_length_m, inner)
+        camera = Camera(width, height, 2.0, D200.k_cam_px(2.0, width), 0.5, D200.focal_length_m).seen_through(D200)
         truth = photo.depth_m.copy()
         truth[_near_steps(filled(truth)) | (filled(truth) > D200_LIMIT_M)] = np.nan
         yield Case(photo.name, photo.image, truth, camera, "auto")
@@ -160,8 +163,7 @@ def procedural_cases(count: int, side: int) -> Iterator[Case]:
     for sample in itertools.islice((s for s in drawn if s.shot.side == side), count):
         shot = sample.shot
         height, width = sample.excess.shape
-        fx = shot.focal_length_px
-        inner = Intrinsics(fx, fx, (width - 1) / 2, (height - 1) / 2)
+        inner = _centred(shot.focal_length_px, width, height)
         camera = Camera(width, height, shot.focus_distance_m, shot.k_cam_px, shot.gamma_px, intrinsics=inner)
         truth = np.float32(shot.focus_distance_m) / (1 + sample.excess.astype(np.float32))
         image = np.ascontiguousarray(sample.image.transpose(1, 2, 0))
@@ -180,7 +182,7 @@ def blender_cases(folder: Path, count: int) -> Iterator[Case]:
     for photo in _spread(folder, count):
         height, width = photo.image.shape[:2]
         told = cameras[photo.name]
-        inner = Intrinsics(told["fx_px"], told["fx_px"], (width - 1) / 2, (height - 1) / 2)
+        inner = _centred(told["fx_px"], width, height)
         camera = Camera(width, height, told["focus_distance_m"], told["k_cam_px"], told["gamma_px"], intrinsics=inner)
         blur_px = thin_lens.blur_at_depth(photo.depth_m, camera.focus_distance_m, camera.k_cam_px, camera.gamma_px)
         yield Case(photo.name, photo.image, photo.depth_m, camera, "auto", blur_px)

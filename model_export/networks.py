@@ -210,7 +210,7 @@ class CompactBlur(nn.Module):
         inputs = 12 + BandEnergy.OCTAVES * BandEnergy.BANDS
         self.unet = UNet(inputs, self.WIDTHS, dilations=self.DILATIONS)
         self.head = nn.Conv2d(self.WIDTHS[0], 2, 1)
-        nn.init.constant_(self.head.bias[0:1], math.log(2.0))  # type: ignore[index]
+        nn.init.constant_(self.head.get_parameter("bias")[0:1], math.log(2.0))
 
     def forward(self, image: Tensor) -> BlurEstimate:
         with torch.autocast(image.device.type, enabled=False):
@@ -239,7 +239,7 @@ class CompactDepth(nn.Module):
         self.head = nn.Conv2d(self.WIDTHS[0], 5, 1)
         with torch.no_grad():
             self.head.weight.mul_(0.1)
-            self.head.bias.copy_(torch.tensor([-0.5, -0.5, 1.5, 0.0, -1.5]))  # type: ignore[union-attr]
+            self.head.get_parameter("bias").copy_(torch.tensor([-0.5, -0.5, 1.5, 0.0, -1.5]))
 
     def forward(self, defocus: Tensor, spread: Tensor, scene: Scene, features: Features) -> DepthEstimate:
         with torch.autocast(defocus.device.type, enabled=False):

@@ -216,12 +216,12 @@ def draw_sample(seed: int, config: SceneConfig, photographs: list[NDArray[np.uin
     shot = draw_shot(rng, config)
     if rng.random() >= RESCALED_SHARE:
         return Sample(*_photograph(rng, shot, config, photographs), shot)
-    ratio = rng.uniform(*RESCALES)
     size = config.size_px
-    ratio = round(size * ratio) / size
+    larger_px = round(size * rng.uniform(*RESCALES))
+    ratio = larger_px / size
     larger = replace(
         config,
-        size_px=round(size * ratio),
+        size_px=larger_px,
         margin_px=round(config.margin_px * ratio),
         defocus_px=(config.defocus_px[0] * ratio, config.defocus_px[1] * ratio),
     )

@@ -58,13 +58,13 @@ def scene_stream(
 ) -> Iterator[Sample]:
     """Scenes ``start`` to ``end`` in order, drawn ahead by worker processes (0: in this one)."""
     stream = SceneStream(config, photographs, start, end)
-    ahead = {"prefetch_factor": 64, "multiprocessing_context": "forkserver"} if workers else {}
     loader: DataLoader[Sample] = DataLoader(
         stream,
         batch_size=None,
         num_workers=workers,
         worker_init_fn=_worker_start,
-        **ahead,  # type: ignore[arg-type]
+        prefetch_factor=64 if workers else None,
+        multiprocessing_context="forkserver" if workers else None,
     )
     return iter(loader)
 

@@ -7,7 +7,7 @@ pixel's own box and all else that is gamma has its part.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -65,17 +65,7 @@ def fit_edge(light: NDArray[np.float32], x_px: float, y_px: float, radius_px: fl
     gaussian, disc = _fitted(patch, start, "gaussian"), _fitted(patch, start, "disc")
     best = disc if disc.residual < CLEARLY * gaussian.residual else gaussian
     _check(best, radius_px)
-    return EdgeFit(
-        best.x_px + left,
-        best.y_px + top,
-        best.radius_px,
-        best.semi_axes_px,
-        best.blur_px,
-        best.blur_error_px,
-        best.shape,
-        best.contrast,
-        best.residual,
-    )
+    return replace(best, x_px=best.x_px + left, y_px=best.y_px + top)
 
 
 def _patch(light: NDArray[np.float32], x_px: float, y_px: float, radius_px: float) -> tuple[Array, int, int]:
@@ -101,7 +91,6 @@ def _start(patch: Array, x: float, y: float, radius: float) -> Array:
 def _fitted(patch: Array, start: Array, shape: Shape) -> EdgeFit:
     places: Array = np.indices(patch.shape, dtype=np.float64)
     white = start[7]
-    scale = ROBUST_SCALE
 
     def left_over(values: Array) -> Array:
         return np.asarray((_picture(values, places[1], places[0], shape) - patch) / white).ravel()
@@ -115,7 +104,7 @@ def _fitted(patch: Array, start: Array, shape: Shape) -> EdgeFit:
         bounds=(low, high),
         x_scale=np.array([1, 1, 0.1, 0.1, 0.1, 0.2, 0.1, white, 0.1 * white, 0.1 * white]),
         loss="soft_l1",
-        f_scale=scale,
+        f_scale=ROBUST_SCALE,
         max_nfev=60,
     )
     values, rest = found.x, left_over(found.x)
