@@ -20,15 +20,17 @@ from service.optics import thin_lens
 SIDES = ("near", "far", "both")
 SIDE_SHARES = (0.45, 0.2, 0.35)
 LAYERED_SHARE = 0.7
-NEAREST_AT_MOST, FARTHEST_AT_LEAST = 0.6, 1.5
+NEAREST_AT_MOST, FARTHEST_AT_LEAST = 0.5, 2.0
 CLOSE_SHARE = 0.5
-K_CAM_LEAN = 0.6  # cameras with little blur need fewer examples than those with much
+K_CAM_LEAN = 0.5  # so that every octave of blur has about its share: what is rare is read as what is common
+DISC_SHARE, GAUSSIAN_SHARE = 0.5, 0.2  # what opened-up lenses have, and what soft ones come to
 ROUND_SHARE = 0.7
 CHROMATIC_SHARE = 0.4
 CHROMATIC_PX = 0.8
 CHROMATIC_PART = 0.15
 MOSAIC_SHARE = 0.4
 MOSAIC_VARIANCE = 0.35  # what a bilinear demosaic adds to luminance, px^2
+PLAIN_SHARE = 0.35  # not compressed: the network must not need the noise of JPEG
 RESCALED_SHARE = 0.15
 RESCALES = (1.2, 1.6)
 Map = NDArray[np.float32]
@@ -86,7 +88,7 @@ def draw_shot(rng: np.random.Generator, config: SceneConfig) -> Shot:
 def _draw_spread(rng: np.random.Generator, k_cam_px: float) -> PointSpread:
     """A Gaussian, a disc or between; sometimes squeezed; sometimes red and blue focused elsewhere than green."""
     shape = rng.random()
-    disc_share = 0.0 if shape < 0.25 else 1.0 if shape > 0.65 else rng.uniform(0.3, 1.0)
+    disc_share = 0.0 if shape < GAUSSIAN_SHARE else 1.0 if shape > 1 - DISC_SHARE else rng.uniform(0.3, 1.0)
     squeeze = 1.0 if rng.random() < ROUND_SHARE else rng.uniform(0.7, 1.0)
     shift = min(CHROMATIC_PX, CHROMATIC_PART * k_cam_px) if rng.random() < CHROMATIC_SHARE else 0.0
     red, blue = rng.uniform(-shift, shift, 2).tolist()
@@ -102,12 +104,12 @@ def _excess_bounds(shot: Shot, config: SceneConfig) -> tuple[float, float]:
 
 
 def _draw_excess(rng: np.random.Generator, shot: Shot, config: SceneConfig) -> float:
-    """q - 1 of one surface: a third of the time uniform in blur, else log-uniform, on a side the shot has."""
+    """q - 1 of one surface: half of the time uniform in blur, else log-uniform, on a side the shot has."""
     low, high = _excess_bounds(shot, config)
     far = shot.side > 0 or (shot.side == 0 and rng.random() < 0.5)
     end = -low if far else high
     first = min(config.defocus_px[0] / shot.k_cam_px, end / 2)
-    amount = rng.uniform(0, end) if rng.random() < 1 / 3 else _log_uniform(rng, (first, end))
+    amount = rng.uniform(0, end) if rng.random() < 0.5 else _log_uniform(rng, (first, end))
     return -amount if far else amount
 
 
@@ -203,7 +205,7 @@ def develop(rng: np.random.Generator, linear: Map, config: SceneConfig, *, throu
         soft = cv2.GaussianBlur(encoded, (0, 0), rng.uniform(0.7, 1.5))
         encoded = encoded + rng.uniform(0.1, 0.5) * (encoded - soft)
     pixels = (np.clip(encoded, 0, 1) * 255 + 0.5).astype(np.uint8)
-    if rng.random() < 0.2:
+    if rng.random() < PLAIN_SHARE:
         return pixels
     quality = int(rng.integers(config.jpeg_quality[0], config.jpeg_quality[1] + 1))
     packed = cv2.imencode(".jpg", pixels[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1]

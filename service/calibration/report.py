@@ -1,0 +1,73 @@
+"""What a calibration tells: of every picture, of every circle, and of the camera."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from service.calibration.fit import Interval
+from service.optics.camera import Intrinsics
+
+Role = Literal["focused", "defocused"]
+Method = Literal["edge", "paper"]
+
+
+@dataclass(frozen=True, slots=True)
+class PictureReport:
+    """One photograph: whether its grid was found, how many circles were measured, and where the grid stood.
+
+    ``blur_px`` is the median lambda of its circles, ``distance_m`` the depth of the grid's middle along the axis and
+    ``tilt_deg`` the angle between the grid and the sensor; None as long as they are not known.
+    """
+
+    name: str
+    role: Role
+    found: bool
+    circles: int = 0
+    blur_px: float | None = None
+    distance_m: float | None = None
+    tilt_deg: float | None = None
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One measured circle. ``circle`` is its number in the grid, row by row; ``image`` the picture's name.
+
+    ``k_cam_px`` is what this circle alone says; None in the plane of focus, where it says nothing. An outlier is
+    shown with ``used`` False. ``field`` is the distance from the principal point over half of the picture's diagonal.
+    """
+
+    circle: int
+    image: str
+    depth_m: float
+    blur_px: float
+    blur_error_px: float
+    k_cam_px: float | None
+    field: float
+    used: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """The camera's constants with 95 % intervals, in pixels of pictures of this size, and what they rest on.
+
+    ``focus_distance_m`` is an interval of no width where the user gave it.
+    """
+
+    image_width_px: int
+    image_height_px: int
+    k_cam_px: Interval
+    gamma_px: Interval
+    focus_distance_m: Interval
+    intrinsics: Intrinsics
+    reprojection_rms_px: float
+    samples: tuple[Sample, ...]
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """A finished calibration: either a result, or the problem, in words for the user, that there is none."""
+
+    pictures: tuple[PictureReport, ...]
+    result: Result | None
+    problem: str | None
