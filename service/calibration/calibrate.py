@@ -14,7 +14,7 @@ from service.calibration.target import CircleGrid
 class Picture:
     """One photograph, decoded when it is its turn: ``load`` gives RGB uint8 [h,w,3] as the sensor had it.
 
-    ``load`` may raise ``ServiceError`` (the picture is then reported as not readable, with its words).
+    ``load`` may raise ``CamindError`` (the picture is then reported as not readable, with its words).
     """
 
     name: str
