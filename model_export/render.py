@@ -19,6 +19,7 @@ from torch import Tensor
 
 from service.optics import thin_lens
 from service.optics.camera import Camera
+from service.optics.light import decode_srgb, encode_srgb
 
 LEVEL_RATIO = 1.25
 LEVEL_OFFSET_PX = 0.5
@@ -180,20 +181,6 @@ def render_layers(layers: list[Layer], spread: PointSpread) -> tuple[Tensor, Ten
     alpha = torch.stack([part[len(part) // 2] for _, part in parts])
     clear = torch.cat([torch.ones_like(alpha[:1]), torch.cumprod(1 - alpha, 0)[:-1]])
     return composite(parts), (clear * alpha).argmax(0)
-
-
-def decode_srgb(encoded: NDArray[np.float32]) -> NDArray[np.float32]:
-    """sRGB values in 0..1 to linear light (IEC 61966-2-1)."""
-    low = encoded / 12.92
-    high = ((np.maximum(encoded, 0.04) + 0.055) / 1.055) ** 2.4
-    return np.where(encoded <= 0.04045, low, high).astype(np.float32)
-
-
-def encode_srgb(linear: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Linear light in 0..1 to sRGB values (IEC 61966-2-1)."""
-    clipped = np.clip(linear, 0, 1)
-    high = 1.055 * np.maximum(clipped, 1e-4) ** (1 / 2.4) - 0.055
-    return np.where(clipped <= 0.0031308, clipped * 12.92, high).astype(np.float32)
 
 
 def _slices(defocus_px: NDArray[np.float32]) -> NDArray[np.int32]:

@@ -13,9 +13,10 @@ import torch
 from numpy.typing import NDArray
 
 from model_export.config import SceneConfig
-from model_export.render import PIXEL_BOX_VARIANCE, Layer, PointSpread, blur, decode_srgb, encode_srgb, render_layers
+from model_export.render import PIXEL_BOX_VARIANCE, Layer, PointSpread, blur, render_layers
 from model_export.textures import draw_texture
 from service.optics import thin_lens
+from service.optics.light import decode_srgb, encode_srgb
 
 SIDES = ("near", "far", "both")
 SIDE_SHARES = (0.45, 0.2, 0.35)

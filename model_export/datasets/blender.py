@@ -20,8 +20,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from model_export.render import DISC, PIXEL_BOX_VARIANCE, blur, encode_srgb
+from model_export.render import DISC, PIXEL_BOX_VARIANCE, blur
 from service.optics import thin_lens
+from service.optics.light import encode_srgb
 
 BPY = "bpy==5.0.1"
 PYTHON = "python3.11"

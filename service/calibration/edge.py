@@ -8,10 +8,12 @@ pixel's own box and all else that is gamma has its part.
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache, lru_cache
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import RectBivariateSpline
 from scipy.optimize import least_squares
 from scipy.special import chndtr, ndtr
 
@@ -19,13 +21,20 @@ Shape = Literal["gaussian", "disc"]
 Array = NDArray[np.float64]
 
 SOFTNESS_PX = 0.6  # of a disc's rim: pixel, demosaic and diffraction are no disc
-STRAIGHT_FROM = 12.0  # radii in sigmas from which an edge's curvature no longer shows
+STRAIGHT_BELOW = 1 / 12  # sigmas over radius: an edge's curvature no longer shows
+WIDEST = 1.5
+FAR_SIGMAS = 7.0
 REACH_RADII = 1.9
 LEAST_RADIUS_PX = 4.0
 LEAST_CONTRAST = 0.08
 MOST_RESIDUAL = 0.1
 MOST_STRETCH = 2.5
-PROFILE_POINTS = 512
+PROFILE_POINTS = 256
+MOST_PIXELS = 2500
+ALIKE_BELOW_PX = 0.9
+SMALL = 1e-3
+PRECISION = 1e-5
+SLICE_LEVEL = 0.95
 CLEARLY = 0.9  # a small blur looks alike under both, and the Gaussian is then nearer to what pixels do
 ROBUST_SCALE = 0.02
 PARAMETERS = ("x", "y", "log_radius", "stretch", "slant", "log_blur", "contrast", "white", "white_x", "white_y")
@@ -40,7 +49,7 @@ class EdgeFit:
     """One disc: centre and mean radius in px, semi-axes, and lambda with its standard error, all in px.
 
     ``contrast`` is the part of the light that the black takes away; ``residual`` is the rms of what the fit leaves,
-    as a part of the white.
+    as a part of the white. ``values`` are the parameters themselves, to begin from at the next disc.
     """
 
     x_px: float
@@ -52,23 +61,61 @@ class EdgeFit:
     shape: Shape
     contrast: float
     residual: float
+    values: tuple[float, ...] = ()
 
 
-def fit_edge(light: NDArray[np.float32], x_px: float, y_px: float, radius_px: float) -> EdgeFit:
+@dataclass(frozen=True, slots=True)
+class _Patch:
+    """Pixels about one disc: their light and places [n], within a square of ``side`` px whose corner is given."""
+
+    light: Array
+    columns: Array
+    rows: Array
+    side: int
+    left: int
+    top: int
+
+
+def fit_edge(
+    light: NDArray[np.float32], x_px: float, y_px: float, radius_px: float, like: EdgeFit | None = None
+) -> EdgeFit:
     """Measure the dark disc near (x, y) of a picture [h,w] in linear light; the better of both point spreads.
 
-    ``radius_px`` is about that of the disc. Raises ``EdgeError`` for one that is too small, cut off by the border,
-    too faint, or unlike a blurred disc.
+    ``radius_px`` is about that of the disc; ``like``, another disc of the picture, is where to begin. Raises
+    ``EdgeError`` for one that is too small, cut off by the border, too faint, or unlike a blurred disc.
     """
-    patch, left, top = _patch(light, x_px, y_px, radius_px)
-    start = _start(patch, x_px - left, y_px - top, radius_px)
-    gaussian, disc = _fitted(patch, start, "gaussian"), _fitted(patch, start, "disc")
-    best = disc if disc.residual < CLEARLY * gaussian.residual else gaussian
+    patch = _patch(light, x_px, y_px, radius_px)
+    start = _start(patch, x_px - patch.left, y_px - patch.top, radius_px)
+    if like is not None:
+        start[2:7] = like.values[2:7]
+    best = _fitted(patch, start, "gaussian")
+    if best.blur_px > ALIKE_BELOW_PX:
+        disc = _fitted(patch, np.array(best.values), "disc")
+        best = disc if disc.residual < CLEARLY * best.residual else best
     _check(best, radius_px)
-    return replace(best, x_px=best.x_px + left, y_px=best.y_px + top)
+    return replace(best, x_px=best.x_px + patch.left, y_px=best.y_px + patch.top)
 
 
-def _patch(light: NDArray[np.float32], x_px: float, y_px: float, radius_px: float) -> tuple[Array, int, int]:
+def slice_blur(light: NDArray[np.float32], x_px: float, y_px: float, radius_px: float) -> float:
+    """The paper's estimate of lambda (eq. 9), for comparison: it reads 1.329 lambda, and higher with noise.
+
+    A horizontal slice through the disc's middle is scaled to 0..1 (the disc being 1); what is below 0.95 is taken for
+    two halves of a Gaussian, whose integral is lambda sqrt(2 pi). It is half of two error functions, of 1.6657 lambda
+    each. Raises ``EdgeError`` for a disc at the border.
+    """
+    reach = REACH_RADII * radius_px
+    left, right, row = math.floor(x_px - reach), math.ceil(x_px + reach) + 1, round(y_px)
+    if left < 0 or right > light.shape[1] or not 0 <= row < light.shape[0]:
+        raise EdgeError("the circle is too near the border of the picture")
+    along = np.asarray(light[row, left:right], np.float64)
+    span = float(np.ptp(along))
+    if span <= 0:
+        raise EdgeError("there is no circle in the slice")
+    scaled = (along.max() - along) / span
+    return float(scaled[scaled < SLICE_LEVEL].sum()) / math.sqrt(2 * math.pi)
+
+
+def _patch(light: NDArray[np.float32], x_px: float, y_px: float, radius_px: float) -> _Patch:
     if radius_px < LEAST_RADIUS_PX:
         raise EdgeError(f"the circle is {2 * radius_px:.1f} px across, too small: {2 * LEAST_RADIUS_PX:g} are needed")
     reach = REACH_RADII * radius_px
@@ -76,40 +123,54 @@ def _patch(light: NDArray[np.float32], x_px: float, y_px: float, radius_px: floa
     top, bottom = math.floor(y_px - reach), math.ceil(y_px + reach) + 1
     if left < 0 or top < 0 or bottom > light.shape[0] or right > light.shape[1]:
         raise EdgeError("the circle is too near the border of the picture")
-    return np.asarray(light[top:bottom, left:right], np.float64), left, top
+    square = np.asarray(light[top:bottom, left:right], np.float64)
+    rows, columns = (np.asarray(places, np.float64).ravel() for places in np.indices(square.shape))
+    round_ = np.hypot(columns + left - x_px, rows + top - y_px) <= reach
+    chosen = np.flatnonzero(round_)
+    if chosen.size > MOST_PIXELS:  # evenly over the disc: any fixed step of pixels would fall in with their rows
+        chosen = np.random.default_rng(0).choice(chosen, MOST_PIXELS, replace=False)
+    return _Patch(square.ravel()[chosen], columns[chosen], rows[chosen], max(square.shape), left, top)
 
 
-def _start(patch: Array, x: float, y: float, radius: float) -> Array:
-    white = float(np.quantile(patch, 0.95))
+def _start(patch: _Patch, x: float, y: float, radius: float) -> Array:
+    white = float(np.quantile(patch.light, 0.95))
     if white <= 0:
         raise EdgeError("there is no light around the circle")
-    black = float(np.quantile(patch, 0.05))
+    black = float(np.quantile(patch.light, 0.05))
     contrast = min(max(1 - black / white, 0.02), 0.999)
     return np.array([x, y, math.log(radius), 0, 0, math.log(0.15 * radius), contrast, white, 0, 0])
 
 
-def _fitted(patch: Array, start: Array, shape: Shape) -> EdgeFit:
-    places: Array = np.indices(patch.shape, dtype=np.float64)
-    white = start[7]
-
-    def left_over(values: Array) -> Array:
-        return np.asarray((_picture(values, places[1], places[0], shape) - patch) / white).ravel()
-
-    span = max(patch.shape)
+def _fitted(patch: _Patch, start: Array, shape: Shape) -> EdgeFit:
+    white, span = start[7], patch.side
     low = np.array([0, 0, math.log(2), -0.8, -0.8, math.log(0.15), 0.0, 0.2 * white, -white, -white])
     high = np.array([span, span, math.log(span), 0.8, 0.8, math.log(span / 3), 1.2, 3 * white, white, white])
+
+    @lru_cache(maxsize=2)
+    def picture(values: bytes) -> tuple[Array, Array]:
+        return _picture(np.frombuffer(values), patch, shape)
+
+    def left_over(values: Array) -> Array:
+        return np.asarray((picture(values.tobytes())[0] - patch.light) / white)
+
+    def slopes(values: Array) -> Array:
+        return np.asarray(picture(values.tobytes())[1] / white)
+
     found = least_squares(
         left_over,
         np.clip(start, low + 1e-6, high - 1e-6),
+        jac=slopes,
         bounds=(low, high),
         x_scale=np.array([1, 1, 0.1, 0.1, 0.1, 0.2, 0.1, white, 0.1 * white, 0.1 * white]),
         loss="soft_l1",
         f_scale=ROBUST_SCALE,
+        xtol=PRECISION,
+        ftol=PRECISION,
         max_nfev=60,
     )
     values, rest = found.x, left_over(found.x)
-    slopes: Array = np.asarray(found.jac, np.float64)
-    spread = np.linalg.pinv(slopes.T @ slopes) * 2 * found.cost / max(rest.size - values.size, 1)
+    at_end: Array = np.asarray(found.jac, np.float64)
+    spread = np.linalg.pinv(at_end.T @ at_end) * 2 * found.cost / max(rest.size - values.size, 1)
     blur_px = math.exp(values[5])
     radius = math.exp(values[2])
     axes = _semi_axes(radius, values[3], values[4])
@@ -119,6 +180,7 @@ def _fitted(patch: Array, start: Array, shape: Shape) -> EdgeFit:
         shape=shape,
         contrast=float(values[6]),
         residual=float(np.sqrt(np.mean(rest**2))),
+        values=tuple(values.tolist()),
     )
 
 
@@ -127,21 +189,63 @@ def _semi_axes(radius: float, stretch: float, slant: float) -> tuple[float, floa
     return radius / math.sqrt(1 - amount), radius / math.sqrt(1 + amount)
 
 
-def _picture(values: Array, columns: Array, rows: Array, shape: Shape) -> Array:
-    """The light that the parameters (in the order of ``PARAMETERS``) make, over all pixels."""
+def _picture(values: Array, patch: _Patch, shape: Shape) -> tuple[Array, Array]:
+    """The light [n] that the parameters (in the order of ``PARAMETERS``) make, and its slopes [n, parameters]."""
     x, y, log_radius, stretch, slant, log_blur, contrast, white, white_x, white_y = values
-    radius, blur_px = math.exp(log_radius), math.exp(log_blur)
-    u, v = columns - x, rows - y
-    # F = sqrt(w' M w) is 1 on the ellipse; (F - 1) / |grad F| is the distance to it, to first order
-    across, along = ((1 + stretch) * u + slant * v) / radius, (slant * u + (1 - stretch) * v) / radius
-    level = np.sqrt(np.maximum((across * u + along * v) / radius, 1e-12))
-    slope = np.maximum(np.hypot(across, along) / (radius * level), 0.2 / radius)
+    radius = math.exp(log_radius)
+    u, v = patch.columns - x, patch.rows - y
+    distance, by_shape = _distance(u, v, radius, stretch, slant)
+    at = np.linspace(-min(float(-distance.min()) + 1, radius), float(distance.max()) + 1, PROFILE_POINTS)
+
+    def table(larger: float, wider: float) -> Array:
+        return _profile(at, radius * math.exp(larger), math.exp(log_blur + wider), shape)
+
+    middle = table(0, 0)
+    by_radius = (table(SMALL, 0) - table(-SMALL, 0)) / (2 * SMALL)
+    by_blur = (table(0, SMALL) - table(0, -SMALL)) / (2 * SMALL)
+    columns = np.stack([middle, np.gradient(middle, at), by_radius, by_blur], 1)
+    place = np.clip((distance - at[0]) / (at[1] - at[0]), 0, PROFILE_POINTS - 1.001)
+    before = place.astype(np.intp)
+    part = (place - before)[:, None]
+    inside, steepness, by_radius, by_blur = (columns[before] * (1 - part) + columns[before + 1] * part).T
+    paper = white + (white_x * u + white_y * v) / patch.side
+    dark = paper * -contrast
+    slopes = np.empty((u.size, len(PARAMETERS)))
+    slopes[:, :5] = (dark * steepness)[:, None] * by_shape
+    slopes[:, 2] += dark * by_radius
+    slopes[:, 5] = dark * by_blur
+    slopes[:, 6] = -paper * inside
+    lit = 1 - contrast * inside
+    slopes[:, 0] -= white_x / patch.side * lit
+    slopes[:, 1] -= white_y / patch.side * lit
+    slopes[:, 7], slopes[:, 8], slopes[:, 9] = lit, lit * u / patch.side, lit * v / patch.side
+    return paper * lit, slopes
+
+
+def _distance(u: Array, v: Array, radius: float, stretch: float, slant: float) -> tuple[Array, Array]:
+    """Signed distance [n] from the ellipse w' M w = 1, to first order, and its slopes by x, y, log radius and shape.
+
+    With F = sqrt(w' M w), which is 1 on the ellipse, it is (F - 1) / |grad F|.
+    """
+    m_x = ((1 + stretch) * u + slant * v) / radius**2
+    m_y = (slant * u + (1 - stretch) * v) / radius**2
+    square = np.maximum(u * m_x + v * m_y, 1e-9)
+    level, length = np.sqrt(square), np.maximum(np.hypot(m_x, m_y), 1e-9)
+    slope = length / level
     distance = (level - 1) / slope
-    span = float(np.abs(distance).max()) + 1
-    at = np.linspace(-min(span, radius), span, PROFILE_POINTS)
-    inside = np.interp(distance, at, _profile(at, radius, blur_px, shape))
-    side = max(columns.shape)
-    return np.asarray((white + white_x * u / side + white_y * v / side) * (1 - contrast * inside))
+    by_shape = np.empty((u.size, 5))
+    changes: tuple[tuple[Array, Array | float, Array | float], ...] = (  # of w' M w, and of M w
+        (-2 * m_x, -(1 + stretch) / radius**2, -slant / radius**2),
+        (-2 * m_y, -slant / radius**2, -(1 - stretch) / radius**2),
+        (-2 * square, -2 * m_x, -2 * m_y),
+        ((u**2 - v**2) / radius**2, u / radius**2, -v / radius**2),
+        (2 * u * v / radius**2, v / radius**2, u / radius**2),
+    )
+    for i, (of_square, of_x, of_y) in enumerate(changes):
+        of_level = of_square / (2 * level)
+        of_slope = (m_x * of_x + m_y * of_y) / (length * level) - length * of_level / square
+        by_shape[:, i] = of_level / slope - distance * of_slope / slope
+    return distance, by_shape
 
 
 def _profile(at: Array, radius: float, blur_px: float, shape: Shape) -> Array:
@@ -158,10 +262,20 @@ def _profile(at: Array, radius: float, blur_px: float, shape: Shape) -> Array:
 
 
 def _gaussian_profile(at: Array, radius: float, sigma: float) -> Array:
-    if radius > STRAIGHT_FROM * sigma:
-        return np.asarray(ndtr(-at / sigma - sigma / (2 * radius)))
-    from_centre = np.maximum(radius + at, 0)
-    return np.asarray(chndtr((radius / sigma) ** 2, 2, (from_centre / sigma) ** 2))
+    ratio = sigma / radius
+    if ratio < STRAIGHT_BELOW:
+        return np.asarray(ndtr(-at / sigma - ratio / 2))
+    within = np.clip(at, max(-radius, -FAR_SIGMAS * sigma), FAR_SIGMAS * sigma) / sigma
+    return np.asarray(_gaussian_table()(within, np.array([min(ratio, WIDEST)]))[:, 0])
+
+
+@cache
+def _gaussian_table() -> RectBivariateSpline:
+    """How much of a Gaussian at t sigmas from a circle's edge lies inside it, over t and sigma over the radius."""
+    t = np.linspace(-FAR_SIGMAS, FAR_SIGMAS, 141)
+    ratio = np.geomspace(0.9 * STRAIGHT_BELOW, WIDEST, 40)
+    from_centre = np.maximum(1 / ratio + t[:, None], 0)
+    return RectBivariateSpline(t, ratio, chndtr(1 / ratio**2, 2, from_centre**2))
 
 
 def _disc_profile(at: Array, radius: float, spread_radius: float) -> Array:

@@ -1,11 +1,14 @@
 """Blur of many circles at known depths to the camera's constants: lambda^2 = gamma^2 + k_cam^2 (s1/z - 1)^2.
 
+Circles of a picture that was focused on the sheet itself show gamma alone.
+
 With depths on both sides of the plane in focus all three are found together; from one side, or from one distance,
 they trade against each other, and the intervals and warnings say so.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +26,10 @@ RESAMPLES = 200
 CONFIDENCE = 0.95
 OUTLIER = 5.0
 LOOSE = 0.2
+CURVE_POINTS, CURVE_BEYOND = 60, 1.05
+FENCE = 1.5  # quartile ranges beyond the quartiles: outliers as a box plot has them
+LEAST_EXCESS = 0.05
+MUST_SHOW = 0.5  # of gamma, that the largest defocus must reach
 GAMMA_BOUNDS_PX = (0.02, 20.0)
 K_CAM_BOUNDS_PX = (0.01, 2000.0)
 FOCUS_REACH = 3.0
@@ -35,16 +42,32 @@ class FitError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Circles:
-    """Measured circles, each array [n]: depth along the axis, lambda with its standard error, and which picture."""
+    """Measured circles, each array [n]: depth along the axis, lambda with its standard error, and which picture.
+
+    ``is_focused`` marks those of pictures for which the lens was focused on the sheet; by default there are none.
+    """
 
     depth_m: Array
     blur_px: Array
     blur_error_px: Array
     picture: NDArray[np.int64]
+    is_focused: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
+
+    def __post_init__(self) -> None:
+        if self.is_focused.size == 0:
+            object.__setattr__(self, "is_focused", np.zeros(self.depth_m.size, np.bool_))
 
     def only(self, where: NDArray[np.int64] | NDArray[np.bool_]) -> "Circles":
         """Those at the given places."""
-        return Circles(self.depth_m[where], self.blur_px[where], self.blur_error_px[where], self.picture[where])
+        return Circles(*(getattr(self, column.name)[where] for column in fields(self)))
+
+    def farther(self, factor: float) -> "Circles":
+        """The same, all depths times a factor."""
+        return replace(self, depth_m=self.depth_m * factor)
+
+    def excess(self, focus_m: float) -> Array:
+        """|s1/z - 1|, 0 where the lens was focused on the sheet."""
+        return np.where(self.is_focused, 0.0, thin_lens.relative_defocus(self.depth_m, focus_m))
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +84,16 @@ class Interval:
 
 
 @dataclass(frozen=True, slots=True)
+class CurvePoint:
+    """Lambda at one depth by the constants found, and where it lies with a confidence of 95 %."""
+
+    depth_m: float
+    blur_px: float
+    low_px: float
+    high_px: float
+
+
+@dataclass(frozen=True, slots=True)
 class Constants:
     """What the circles say of the camera; ``is_outlier`` [n] marks circles that fit nothing, shown, not dropped."""
 
@@ -69,41 +102,108 @@ class Constants:
     focus_distance_m: Interval
     rms_px: float
     is_outlier: NDArray[np.bool_]
+    curve: tuple[CurvePoint, ...]
     warnings: tuple[str, ...]
 
 
 def fit_constants(
-    circles: Circles, focus_distance_m: float | None = None, *, resamples: int = RESAMPLES, seed: int = 0
+    circles: Circles,
+    focus_distance_m: float | None = None,
+    *,
+    depth_error: float = 0.0,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
 ) -> Constants:
     """The constants with 95 % intervals by a bootstrap over pictures; the focus distance is fitted unless given.
 
-    Raises ``FitError`` for fewer than four circles or for circles that show no blur to measure.
+    ``depth_error`` is the relative standard error that all depths have in common, as from the focal length. Raises
+    ``FitError`` for fewer than four circles or for circles that show no blur by defocus.
     """
-    if circles.depth_m.size < LEAST_CIRCLES:
-        raise FitError(f"{circles.depth_m.size} circles were measured; at least {LEAST_CIRCLES} are needed")
-    best = _fitted(circles, focus_distance_m, None)
+    defocused = ~circles.is_focused
+    if defocused.sum() < LEAST_CIRCLES:
+        raise FitError(f"{defocused.sum()} defocused circles were measured; at least {LEAST_CIRCLES} are needed")
+
+    def fit(some: Circles, start: Array | None) -> Array:
+        return _fitted(some, focus_distance_m, start)
+
+    return _constants(circles, fit, focus_distance_m, depth_error, resamples, seed)
+
+
+def fit_as_paper(
+    circles: Circles,
+    focus_distance_m: float,
+    *,
+    depth_error: float = 0.0,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+) -> Constants:
+    """The paper's procedure: gamma from the focused pictures, k_cam of each defocused circle, outliers out, median.
+
+    Raises ``FitError`` without focused and defocused circles.
+    """
+    if circles.is_focused.sum() < LEAST_CIRCLES or (~circles.is_focused).sum() < LEAST_CIRCLES:
+        raise FitError("the paper's method needs circles of focused and of defocused pictures")
+
+    def fit(some: Circles, start: Array | None) -> Array:
+        sharp = some.blur_px[some.is_focused]
+        gamma = float(np.median(sharp)) if sharp.size or start is None else float(start[1])
+        k_cam = per_circle_k_cam(some, gamma, focus_distance_m)
+        k_cam = k_cam[np.isfinite(k_cam)]
+        if k_cam.size == 0:
+            return np.array([math.nan, gamma, focus_distance_m]) if start is None else start
+        low, high = np.quantile(k_cam, [0.25, 0.75])
+        kept = k_cam[(k_cam >= low - FENCE * (high - low)) & (k_cam <= high + FENCE * (high - low))]
+        return np.array([float(np.median(kept)), gamma, focus_distance_m])
+
+    return _constants(circles, fit, focus_distance_m, depth_error, resamples, seed)
+
+
+def per_circle_k_cam(circles: Circles, gamma_px: float, focus_m: float) -> Array:
+    """What each circle alone says of k_cam [n]; NaN where it is focused, or too near the plane in focus."""
+    excess = circles.excess(focus_m)
+    sigma = thin_lens.defocus_from_blur(circles.blur_px, gamma_px)
+    says = (excess > LEAST_EXCESS) & (sigma > 0)
+    return np.where(says, sigma / np.maximum(excess, LEAST_EXCESS), np.nan)
+
+
+def _constants(
+    circles: Circles,
+    fit: Callable[[Circles, Array | None], Array],
+    focus_m: float | None,
+    depth_error: float,
+    resamples: int,
+    seed: int,
+) -> Constants:
+    best = fit(circles, None)
+    if not best[0] * circles.excess(best[2]).max() > MUST_SHOW * best[1]:
+        raise FitError(
+            "no circle is blurred by defocus: photograph the sheet well nearer and farther than the plane in focus, "
+            "with the aperture open"
+        )
     rest = _left_over(best, circles)
     scale = max(1.4826 * float(np.median(np.abs(rest))), 1e-6)
-    drawn = _resampled(circles, focus_distance_m, best, resamples, seed)
+    drawn = _resampled(circles, fit, best, depth_error, resamples, seed)
     pictures = np.unique(circles.picture).size
     widen = _widening(pictures if pictures > 1 else circles.depth_m.size)
     k_cam, gamma, focus = (_interval(best[i], drawn[:, i], widen) for i in range(3))
-    model = thin_lens.blur_at_depth(circles.depth_m, best[2], best[0], best[1])
     return Constants(
         k_cam_px=k_cam,
         gamma_px=gamma,
         focus_distance_m=focus,
-        rms_px=float(np.sqrt(np.mean((model - circles.blur_px) ** 2))),
+        rms_px=float(np.sqrt(np.mean((_model(best, circles) - circles.blur_px) ** 2))),
         is_outlier=np.abs(rest) > OUTLIER * scale,
-        warnings=tuple(_warnings(circles, (k_cam, gamma, focus), is_focus_given=focus_distance_m is not None)),
+        curve=tuple(_curve(circles.depth_m, best, drawn, widen)),
+        warnings=tuple(_warnings(circles, (k_cam, gamma, focus), is_focus_given=focus_m is not None)),
     )
 
 
+def _model(constants: Array, circles: Circles) -> Array:
+    return np.asarray(thin_lens.blur_from_defocus(constants[0] * circles.excess(constants[2]), constants[1]))
+
+
 def _left_over(constants: Array, circles: Circles) -> Array:
-    k_cam_px, gamma_px, focus_m = constants
-    model = thin_lens.blur_at_depth(circles.depth_m, focus_m, k_cam_px, gamma_px)
     error = np.sqrt(circles.blur_error_px**2 + FLOOR_PX**2 + (FLOOR_PART * circles.blur_px) ** 2)
-    return np.asarray((model - circles.blur_px) / error)
+    return np.asarray((_model(constants, circles) - circles.blur_px) / error)
 
 
 def _fitted(circles: Circles, focus_m: float | None, start: Array | None) -> Array:
@@ -134,14 +234,21 @@ def _fitted(circles: Circles, focus_m: float | None, start: Array | None) -> Arr
 
 def _start(circles: Circles, focus_m: float) -> Array:
     gamma = max(0.9 * float(circles.blur_px.min()), 2 * GAMMA_BOUNDS_PX[0])
-    x = thin_lens.relative_defocus(circles.depth_m, focus_m)
+    x = circles.excess(focus_m)
     sigma = thin_lens.defocus_from_blur(circles.blur_px, gamma)
     k_cam = float(np.median(sigma[x > np.median(x) / 2] / np.maximum(x[x > np.median(x) / 2], 1e-3)))
     return np.array([max(k_cam, 2 * K_CAM_BOUNDS_PX[0]), gamma, focus_m])
 
 
-def _resampled(circles: Circles, focus_m: float | None, best: Array, count: int, seed: int) -> Array:
-    """Constants [count, 3] of pictures drawn with replacement (of circles, if there is one picture)."""
+def _resampled(
+    circles: Circles,
+    fit: Callable[[Circles, Array | None], Array],
+    best: Array,
+    depth_error: float,
+    count: int,
+    seed: int,
+) -> Array:
+    """Constants [count, 3] of pictures drawn with replacement (of circles, if there is one), depths in doubt alike."""
     rng = np.random.default_rng(seed)
     labels = np.unique(circles.picture)
     groups = [np.flatnonzero(circles.picture == label) for label in labels]
@@ -150,7 +257,8 @@ def _resampled(circles: Circles, focus_m: float | None, best: Array, count: int,
     rows = []
     for _ in range(count):
         picked = rng.integers(0, len(groups), len(groups))
-        rows.append(_fitted(circles.only(np.concatenate([groups[i] for i in picked])), focus_m, best))
+        some = circles.only(np.concatenate([groups[i] for i in picked]))
+        rows.append(fit(some.farther(math.exp(depth_error * rng.standard_normal())), best))
     return np.array(rows)
 
 
@@ -168,17 +276,27 @@ def _interval(value: float, drawn: Array, widen: float) -> Interval:
     )
 
 
+def _curve(depth_m: Array, best: Array, drawn: Array, widen: float) -> Iterator[CurvePoint]:
+    """The fitted curve over the depths there are, a little beyond, at equal steps of 1/z."""
+    near, far = float(depth_m.min()) / CURVE_BEYOND, float(depth_m.max()) * CURVE_BEYOND
+    for z in 1 / np.linspace(1 / near, 1 / far, CURVE_POINTS):
+        value = float(thin_lens.blur_at_depth(z, best[2], best[0], best[1]))
+        interval = _interval(value, thin_lens.blur_at_depth(z, drawn[:, 2], drawn[:, 0], drawn[:, 1]), widen)
+        yield CurvePoint(float(z), value, interval.low, interval.high)
+
+
 def _warnings(circles: Circles, found: tuple[Interval, Interval, Interval], *, is_focus_given: bool) -> list[str]:
     k_cam, gamma, focus = found
     told = []
     if np.unique(circles.picture).size < 3:
         told.append("fewer than three pictures: the intervals are guesses")
-    near, far = (circles.depth_m < focus.value).any(), (circles.depth_m > focus.value).any()
+    depth_m = circles.depth_m[~circles.is_focused]
+    near, far = (depth_m < focus.value).any(), (depth_m > focus.value).any()
     if not is_focus_given and not (near and far):
         side = "nearer than" if near else "beyond"
         told.append(f"all circles are {side} the focus: photograph both sides, or give the focus distance")
     if max(k_cam.relative_width, focus.relative_width) > LOOSE:
         told.append("the pictures do not separate k_cam_px and focus_distance_m well: see their intervals")
-    if k_cam.value * float(thin_lens.relative_defocus(circles.depth_m, focus.value).max()) < gamma.value:
-        told.append("no circle is blurred clearly by defocus: move nearer or farther, or open the aperture")
+    if k_cam.value * float(circles.excess(focus.value).max()) < gamma.value:
+        told.append("little is blurred by defocus: move nearer or farther, or open the aperture")
     return told

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from service.calibration.fit import Interval
+from service.calibration.fit import CurvePoint, Interval
 from service.optics.camera import Intrinsics
 
 Role = Literal["focused", "defocused"]
@@ -30,19 +30,21 @@ class PictureReport:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One measured circle. ``circle`` is its number in the grid, row by row; ``image`` the picture's name.
+    """One measured circle. ``circle`` is its number in the grid, row by row; ``image`` the picture's name; (u, v) where
+    its centre is there.
 
     ``k_cam_px`` is what this circle alone says; None in the plane of focus, where it says nothing. An outlier is
-    shown with ``used`` False. ``field`` is the distance from the principal point over half of the picture's diagonal.
+    shown with ``used`` False.
     """
 
     circle: int
     image: str
+    u_px: float
+    v_px: float
     depth_m: float
     blur_px: float
     blur_error_px: float
     k_cam_px: float | None
-    field: float
     used: bool
 
 
@@ -61,6 +63,7 @@ class Result:
     intrinsics: Intrinsics
     reprojection_rms_px: float
     samples: tuple[Sample, ...]
+    curve: tuple[CurvePoint, ...]
     warnings: tuple[str, ...] = ()
 
 

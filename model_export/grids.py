@@ -1,0 +1,178 @@
+"""Simulated photographs of a printed grid by a camera that is known: what a calibration is measured against."""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from model_export.render import DISC, GAUSSIAN, PIXEL_BOX_VARIANCE, PointSpread, blur, blur_varying
+from service.calibration.target import CircleGrid
+from service.optics import thin_lens
+from service.optics.camera import Intrinsics
+from service.optics.light import encode_srgb
+
+GRID = CircleGrid("asymmetric_circles", 11, 4, 20.0, 14.0)
+FINE = 3
+INK, PAPER, TABLE = 0.04, 0.75, 0.25
+SHEET_MARGIN_MM = 15.0
+MARGIN_PX = 48
+JPEG_QUALITY = 92
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class GridCamera:
+    """A camera to calibrate: blur constants, intrinsics and picture size, and its flaws.
+
+    ``vignetting`` is the light lost in the corners, ``noise`` the standard deviation of a pixel as a part of the white.
+    """
+
+    width_px: int
+    height_px: int
+    k_cam_px: float
+    gamma_px: float
+    focus_distance_m: float
+    intrinsics: Intrinsics
+    spread: PointSpread = DISC
+    vignetting: float = 0.2
+    noise: float = 0.015
+
+
+@dataclass(frozen=True, slots=True)
+class GridPose:
+    """Turn [3,3] and shift [3] (metres) of the sheet, and how much brighter the light is on its one end."""
+
+    turn: Array
+    shift_m: Array
+    gradient: tuple[float, float] = (0.0, 0.0)
+
+
+def draw_camera(rng: np.random.Generator, width_px: int = 1280, height_px: int = 960) -> GridCamera:
+    """A random camera whose blur can be measured on a sheet of paper."""
+    fx = width_px * rng.uniform(0.9, 1.6)
+    distortion = (rng.uniform(-0.15, 0.1), rng.uniform(-0.05, 0.05), *rng.uniform(-1e-3, 1e-3, 2).tolist(), 0.0)
+    middle = np.array([(width_px - 1) / 2, (height_px - 1) / 2]) + rng.uniform(-0.02, 0.02, 2) * width_px
+    return GridCamera(
+        width_px,
+        height_px,
+        k_cam_px=math.exp(rng.uniform(math.log(2.0), math.log(12.0))),
+        gamma_px=rng.uniform(0.4, 1.2),
+        focus_distance_m=math.exp(rng.uniform(math.log(0.35), math.log(0.8))),
+        intrinsics=Intrinsics(fx, fx * rng.uniform(0.998, 1.002), float(middle[0]), float(middle[1]), distortion),
+        spread=DISC if rng.random() < 0.5 else GAUSSIAN,
+        vignetting=rng.uniform(0, 0.4),
+        noise=rng.uniform(0.01, 0.02),
+    )
+
+
+def draw_pose(
+    rng: np.random.Generator, camera: GridCamera, grid: CircleGrid, depth_m: float, *, tilt_deg: float = 25.0
+) -> GridPose:
+    """The sheet with its middle about ``depth_m`` away, tilted by up to ``tilt_deg``, turned, and wholly in view."""
+    middle = np.append(grid.points_mm().mean(0), 0.0) / 1e3
+    for attempt in range(200):
+        tilt, axis, roll = math.radians(rng.uniform(0.2, 1) * tilt_deg), rng.uniform(0, 2 * math.pi), rng.uniform(-1, 1)
+        lean = cv2.Rodrigues(np.array([math.cos(axis), math.sin(axis), 0]) * tilt)[0]
+        turn = np.asarray(lean @ cv2.Rodrigues(np.array([0, 0, roll * 0.5]))[0], np.float64)
+        room = 0.3 * (1 - attempt / 200)
+        aside = rng.uniform(-room, room, 2) * depth_m * camera.width_px / camera.intrinsics.fx_px
+        shift = np.array([*aside, depth_m]) - turn @ middle
+        pose = GridPose(turn, shift, (rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3)))
+        seen = project(camera, pose, grid)
+        edge = 1.6 * grid.diameter_mm / 1e3 / depth_m * camera.intrinsics.fx_px
+        if (seen > edge).all() and (seen < np.array([camera.width_px, camera.height_px]) - edge).all():
+            return pose
+    raise ValueError(f"the sheet does not fit into the picture at {depth_m:.2f} m")
+
+
+def project(camera: GridCamera, pose: GridPose, grid: CircleGrid) -> Array:
+    """The circles' centres [n, 2] in the picture, px."""
+    board = np.column_stack([grid.points_mm(), np.zeros(grid.rows * grid.columns)]) / 1e3
+    matrix, distortion = _matrix(camera), np.array(camera.intrinsics.distortion)
+    return np.asarray(cv2.projectPoints(board, pose.turn, pose.shift_m, matrix, distortion)[0], np.float64).reshape(
+        -1, 2
+    )
+
+
+def _matrix(camera: GridCamera) -> Array:
+    inner = camera.intrinsics
+    return np.array([[inner.fx_px, 0, inner.cx_px], [0, inner.fy_px, inner.cy_px], [0, 0, 1]])
+
+
+def photograph(
+    rng: np.random.Generator, camera: GridCamera, pose: GridPose, grid: CircleGrid, *, focused: bool = False
+) -> NDArray[np.uint8]:
+    """RGB uint8 [h,w,3] as a JPEG holds it; with ``focused`` the lens is focused on every point of the sheet."""
+    margin = MARGIN_PX
+    height, width = camera.height_px + 2 * margin, camera.width_px + 2 * margin
+    sight = _sight(camera, (np.indices((height, width))[::-1].reshape(2, -1).T - margin).astype(np.float64))
+    reached = _reached(sight, pose)
+    on_sheet = (reached - pose.shift_m) @ pose.turn
+    depth_m = reached[:, 2].reshape(height, width)
+    sharp = _printed(pose, grid, on_sheet[:, :2].reshape(height, width, 2) * 1e3)
+    light = torch.from_numpy(sharp[None])
+    if not focused:
+        signed = thin_lens.signed_defocus(depth_m, camera.focus_distance_m) * camera.k_cam_px
+        light = blur_varying(light, torch.from_numpy(np.abs(signed).astype(np.float32)), camera.spread)
+    light = blur(light, math.sqrt(max(camera.gamma_px**2 - PIXEL_BOX_VARIANCE, 0.0)))
+    inner = light[0].numpy()[margin : margin + camera.height_px, margin : margin + camera.width_px]
+    v, u = np.indices(inner.shape)
+    away = (
+        np.hypot(u - camera.width_px / 2, v - camera.height_px / 2) / math.hypot(camera.width_px, camera.height_px) * 2
+    )
+    picture = np.repeat((inner * (1 - camera.vignetting * away**2))[..., None], 3, axis=2)
+    noisy = picture + camera.noise * np.sqrt(PAPER * picture) * rng.standard_normal(picture.shape)
+    pixels = (encode_srgb(noisy.astype(np.float32)) * 255 + 0.5).astype(np.uint8)
+    packed = cv2.imencode(".jpg", pixels[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
+    return np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)[:, :, ::-1].copy()
+
+
+def _sight(camera: GridCamera, pixels: Array) -> Array:
+    """Directions [n, 3] with z = 1 of pixels [n, 2]."""
+    flat = cv2.undistortPoints(pixels[:, None], _matrix(camera), np.array(camera.intrinsics.distortion))
+    return np.column_stack([np.asarray(flat).reshape(-1, 2), np.ones(len(pixels))])
+
+
+def _reached(sight: Array, pose: GridPose) -> Array:
+    """Where lines of sight meet the sheet's plane [n, 3], metres."""
+    normal = pose.turn[:, 2]
+    return sight * ((normal @ pose.shift_m) / (sight @ normal))[:, None]
+
+
+def _printed(pose: GridPose, grid: CircleGrid, places_mm: Array) -> NDArray[np.float32]:
+    """Light [h,w] of the sharp sheet, each pixel the mean over its square; ``places_mm`` are pixel centres on it."""
+    right = np.gradient(places_mm, axis=1)
+    down = np.gradient(places_mm, axis=0)
+    points = grid.points_mm()
+    low, high = (
+        points.min(0) - SHEET_MARGIN_MM - grid.diameter_mm / 2,
+        points.max(0) + SHEET_MARGIN_MM + grid.diameter_mm / 2,
+    )
+    total = np.zeros(places_mm.shape[:2], np.float32)
+    offsets = (np.arange(FINE) + 0.5) / FINE - 0.5
+    for a in offsets:
+        for b in offsets:
+            at = places_mm + a * right + b * down
+            inked = _is_inked(grid, at)
+            paper = ((at > low) & (at < high)).all(-1)
+            slope = (at - points.mean(0)) @ np.array(pose.gradient) / (high - low).max()
+            total += np.where(inked, INK, np.where(paper, PAPER, TABLE)) * (1 + slope)
+    return np.asarray(total / FINE**2, np.float32)
+
+
+def _is_inked(grid: CircleGrid, at_mm: Array) -> NDArray[np.bool_]:
+    """Whether places [..., 2] lie in a printed circle."""
+    out = np.zeros(at_mm.shape[:-1], bool)
+    spacing, is_asymmetric = grid.spacing_mm, grid.kind == "asymmetric_circles"
+    rows = np.rint(at_mm[..., 1] / spacing)
+    for step in (-1, 0, 1):
+        row = np.clip(rows + step, 0, grid.rows - 1)
+        shift = (row % 2) * spacing if is_asymmetric else 0.0
+        pitch = 2 * spacing if is_asymmetric else spacing
+        column = np.clip(np.rint((at_mm[..., 0] - shift) / pitch), 0, grid.columns - 1)
+        out |= np.hypot(at_mm[..., 0] - column * pitch - shift, at_mm[..., 1] - row * spacing) < grid.diameter_mm / 2
+    return out

@@ -1,0 +1,305 @@
+"""Find the printed grid in a photograph, sharp or blurred, and say which circle is which.
+
+Both kinds of grid are a square lattice. Dark blobs are joined to a lattice neighbour by neighbour, so that perspective
+and distortion only need to be small from one circle to the next, and the lattice is then laid over the printed
+pattern in every rotation.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from service.calibration.target import CircleGrid
+from service.opencv import cv2
+
+COARSEST_PX = 640
+FINEST_PX = 2600
+LEAST_AREA_PX = 16.0
+LARGEST_PART = 0.3
+THRESHOLD_STEP = 8.0
+LEAST_CIRCULARITY = 0.6
+LEAST_CONVEXITY = 0.85
+LEAST_INERTIA = 0.15
+NEIGHBOURS = 8
+SEEDS = 40
+ANGLES_DEG = (35.0, 145.0)
+LIKE_LENGTH = 2.2
+LIKE_SIZE = 1.6
+REACH = 0.32
+LEAST_FOUND = 0.7
+BORDER_STEPS = 0.9
+LEAST_RADIUS_PX = 3.0
+Array = NDArray[np.float64]
+Cell = tuple[int, int]
+
+
+class GridError(Exception):
+    """Why the grid was not found, in words for the user."""
+
+
+@dataclass(frozen=True, slots=True)
+class FoundGrid:
+    """Where the printed circles [n, 2] are in the picture (px), row by row, and about how large [n].
+
+    ``seen`` [n] is False where a circle was filled in from its neighbours.
+    """
+
+    centres_px: Array
+    radii_px: Array
+    seen: NDArray[np.bool_]
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Blobs:
+    places: Array
+    sizes: Array
+    tree: cKDTree
+
+
+def find_grid(grey: NDArray[np.uint8], grid: CircleGrid) -> FoundGrid:
+    """The grid in a grey picture [h,w]. Raises ``GridError`` that says what is wrong with the picture.
+
+    Looks at a small copy first, in which blur is small too, and at larger ones for small circles.
+    """
+    nearest = GridError("no grid of dark circles was found")
+    longest = max(grey.shape)
+    side = min(COARSEST_PX, longest)
+    while True:
+        ratio = side / longest
+        small = cv2.resize(grey, None, fx=ratio, fy=ratio, interpolation=cv2.INTER_AREA) if ratio < 1 else grey
+        try:
+            found = _find(np.asarray(small, np.uint8), grid)
+        except GridError as error:
+            nearest = error if _says_more(error, nearest) else nearest
+        else:
+            return _checked(found, ratio, grid)
+        if side >= min(FINEST_PX, longest):
+            raise nearest
+        side = min(2 * side, FINEST_PX, longest)
+
+
+def _says_more(error: GridError, other: GridError) -> bool:
+    return len(str(error)) > len(str(other))
+
+
+def _checked(found: FoundGrid, ratio: float, grid: CircleGrid) -> FoundGrid:
+    """The grid at the size of the whole picture, if its circles are large enough and all in it."""
+    centres = (found.centres_px + 0.5) / ratio - 0.5
+    radii = radii_px(grid, centres)
+    if float(np.median(radii)) < LEAST_RADIUS_PX:
+        raise GridError(
+            f"the circles are too small: {2 * np.median(radii):.1f} px across, {2 * LEAST_RADIUS_PX:g} are needed"
+        )
+    return FoundGrid(centres, radii, found.seen, found.warnings)
+
+
+def homography(grid: CircleGrid, centres_px: Array) -> Array:
+    """The plane-to-picture map [3,3] that fits all circles best: from millimetres on the sheet to pixels."""
+    matrix, _ = cv2.findHomography(grid.points_mm(), centres_px, 0)
+    return np.asarray(matrix, np.float64)
+
+
+def projected(matrix: Array, points: Array) -> Array:
+    """Points [n,2] through a homography."""
+    through = points @ matrix[:, :2].T + matrix[:, 2]
+    return np.asarray(through[:, :2] / through[:, 2:])
+
+
+def radii_px(grid: CircleGrid, centres_px: Array) -> Array:
+    """About how large each circle is in the picture: the geometric mean of its semi-axes [n]."""
+    matrix = homography(grid, centres_px)
+    points = grid.points_mm()
+    step = grid.diameter_mm / 8
+    right, down = np.array([step, 0.0]), np.array([0.0, step])
+    across = projected(matrix, points + right) - projected(matrix, points - right)
+    along = projected(matrix, points + down) - projected(matrix, points - down)
+    area = np.abs(across[:, 0] * along[:, 1] - across[:, 1] * along[:, 0]) / (2 * step) ** 2
+    return np.asarray(np.sqrt(area) * grid.diameter_mm / 2)
+
+
+def _find(grey: NDArray[np.uint8], grid: CircleGrid) -> FoundGrid:
+    blobs = _blobs(grey)
+    wanted = _lattice_cells(grid)
+    best: dict[Cell, int] = {}
+    for first, u, v in _seeds(blobs):
+        cells = _grown(blobs, first, u, v)
+        if len(cells) > len(best):
+            best = cells
+        if len(cells) >= LEAST_FOUND * len(wanted):
+            found = _laid(cells, blobs, wanted, grid)
+            if found is not None:
+                return found
+    raise GridError(_why(best, blobs, wanted, grey.shape))
+
+
+def _blobs(grey: NDArray[np.uint8]) -> _Blobs:
+    settings = cv2.SimpleBlobDetector.Params()
+    settings.minThreshold, settings.maxThreshold, settings.thresholdStep = 8.0, 248.0, THRESHOLD_STEP
+    settings.filterByColor, settings.blobColor = True, 0
+    settings.filterByArea = True
+    settings.minArea, settings.maxArea = LEAST_AREA_PX, (LARGEST_PART * min(grey.shape)) ** 2
+    settings.filterByCircularity, settings.minCircularity = True, LEAST_CIRCULARITY
+    settings.filterByConvexity, settings.minConvexity = True, LEAST_CONVEXITY
+    settings.filterByInertia, settings.minInertiaRatio = True, LEAST_INERTIA
+    settings.minDistBetweenBlobs = 4.0
+    found = cv2.SimpleBlobDetector.create(settings).detect(grey)
+    if len(found) < 4:
+        raise GridError("no grid of dark circles was found")
+    places = np.array([blob.pt for blob in found], np.float64)
+    return _Blobs(places, np.array([blob.size for blob in found], np.float64), cKDTree(places))
+
+
+def _seeds(blobs: _Blobs) -> Iterator[tuple[int, Array, Array]]:
+    """Blobs with two neighbours that may be those along the lattice's two axes, most regular surroundings first."""
+    count = min(NEIGHBOURS + 1, len(blobs.places))
+    away, others = (np.asarray(found) for found in blobs.tree.query(blobs.places, count))
+    evenness = away[:, min(4, count - 1)] / np.maximum(away[:, 1], 1e-6)
+    alike = np.ptp(np.log(blobs.sizes[others[:, : min(5, count)]]), axis=1)
+    for first in np.argsort(evenness + 2 * alike)[:SEEDS]:
+        steps = blobs.places[others[first, 1:]] - blobs.places[first]
+        sizes = blobs.sizes[others[first, 1:]] / blobs.sizes[first]
+        steps = steps[(sizes < LIKE_SIZE) & (sizes > 1 / LIKE_SIZE)]
+        for i in range(min(4, len(steps))):
+            for j in range(i + 1, min(5, len(steps))):
+                u, v = steps[i], steps[j]
+                angle = math.degrees(math.acos(np.clip(u @ v / np.linalg.norm(u) / np.linalg.norm(v), -1, 1)))
+                lengths = np.linalg.norm(u) / np.linalg.norm(v)
+                if ANGLES_DEG[0] < angle < ANGLES_DEG[1] and 1 / LIKE_LENGTH < lengths < LIKE_LENGTH:
+                    yield int(first), u, v
+
+
+def _grown(blobs: _Blobs, first: int, u: Array, v: Array) -> dict[Cell, int]:
+    """The lattice that goes on from one blob: cell to blob. Each step is guessed from the steps next to it."""
+    cells: dict[Cell, int] = {(0, 0): first}
+    taken = {first}
+    bases = {(0, 0): (u, v)}
+    edge = [(0, 0)]
+    while edge:
+        cell = edge.pop(0)
+        here, basis = blobs.places[cells[cell]], bases[cell]
+        for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
+            beside = (cell[0] + sign * (axis == 0), cell[1] + sign * (axis == 1))
+            if beside in cells:
+                continue
+            step = sign * basis[axis]
+            away, found = blobs.tree.query(here + step)
+            size = blobs.sizes[found] / blobs.sizes[cells[cell]]
+            if found in taken or away > REACH * np.linalg.norm(step) or not 1 / LIKE_SIZE < size < LIKE_SIZE:
+                continue
+            cells[beside] = int(found)
+            taken.add(int(found))
+            bases[beside] = _basis(cells, blobs, beside, basis)
+            edge.append(beside)
+    return cells
+
+
+def _basis(cells: dict[Cell, int], blobs: _Blobs, cell: Cell, basis: tuple[Array, Array]) -> tuple[Array, Array]:
+    """The lattice's two steps at a cell: measured to neighbours that are known, else those of where one came from."""
+    here = blobs.places[cells[cell]]
+    steps = []
+    for axis in (0, 1):
+        known = [
+            sign * (blobs.places[cells[beside]] - here)
+            for sign in (1, -1)
+            if (beside := (cell[0] + sign * (axis == 0), cell[1] + sign * (axis == 1))) in cells
+        ]
+        steps.append(np.mean(known, axis=0) if known else basis[axis])
+    return steps[0], steps[1]
+
+
+def _lattice_cells(grid: CircleGrid) -> list[Cell]:
+    """The printed circles' places in the lattice of nearest neighbours, row by row."""
+    points = np.rint(grid.points_mm() / grid.spacing_mm).astype(int)
+    if grid.kind == "asymmetric_circles":
+        points = np.stack([(points[:, 0] + points[:, 1]) // 2, (points[:, 1] - points[:, 0]) // 2], 1)
+    return [(int(a), int(b)) for a, b in points]
+
+
+def _laid(cells: dict[Cell, int], blobs: _Blobs, wanted: list[Cell], grid: CircleGrid) -> FoundGrid | None:
+    """The lattice laid over the printed pattern where most circles meet, seen from the front; None if it cannot be."""
+    ways = [(turn, shift, hits) for turn in range(4) for shift, hits in _shifts(cells, wanted, turn)]
+    if not ways:
+        return None
+    most = max(hits for _, _, hits in ways)
+    if most < LEAST_FOUND * len(wanted) or len(cells) - most > max(2, 0.05 * len(wanted)):
+        return None
+    options = []
+    for turn, shift, hits in ways:
+        if hits == most:
+            chosen = [cells.get(_moved(cell, turn, shift)) for cell in wanted]
+            seen = np.array([blob is not None for blob in chosen])
+            places = np.array([blobs.places[blob] if blob is not None else (np.nan, np.nan) for blob in chosen])
+            options.append((places, seen))
+    if most < len(wanted) and len({tuple(seen) for _, seen in options}) > 1:
+        return None  # an outer row may be missing on either side
+    fronts = [option for option in options if _is_from_front(grid, *option)]
+    if not fronts:
+        return None
+    places, seen = min(fronts, key=lambda option: _turn_to_upright(grid, *option))
+    if not seen.all():
+        matrix, _ = cv2.findHomography(grid.points_mm()[seen], places[seen], 0)
+        places[~seen] = projected(np.asarray(matrix), grid.points_mm()[~seen])
+    return FoundGrid(places, np.zeros(len(places)), seen)
+
+
+def _moved(cell: Cell, turn: int, shift: Cell) -> Cell:
+    a, b = cell
+    for _ in range(turn):
+        a, b = -b, a
+    return a + shift[0], b + shift[1]
+
+
+def _shifts(cells: dict[Cell, int], wanted: list[Cell], turn: int) -> Iterator[tuple[Cell, int]]:
+    """Every shift that may lay the turned pattern on the lattice, with how many circles then meet."""
+    turned = np.array([_moved(cell, turn, (0, 0)) for cell in wanted])
+    have = np.array(list(cells))
+    low, high = have.min(0) - turned.max(0), have.max(0) - turned.min(0)
+    occupied = set(cells)
+    for a in range(low[0], high[0] + 1):
+        for b in range(low[1], high[1] + 1):
+            hits = sum((int(i) + a, int(j) + b) in occupied for i, j in turned)
+            if hits >= LEAST_FOUND * len(wanted):
+                yield (a, b), hits
+
+
+def _axes(grid: CircleGrid, places: Array, seen: NDArray[np.bool_]) -> Array:
+    """The sheet's x and y directions in the picture, as columns [2,2]."""
+    points = grid.points_mm()[seen]
+    design = np.column_stack([points, np.ones(len(points))])
+    return np.asarray(np.linalg.lstsq(design, places[seen], rcond=None)[0][:2].T)
+
+
+def _is_from_front(grid: CircleGrid, places: Array, seen: NDArray[np.bool_]) -> bool:
+    return float(np.linalg.det(_axes(grid, places, seen))) > 0
+
+
+def _turn_to_upright(grid: CircleGrid, places: Array, seen: NDArray[np.bool_]) -> float:
+    """How far (rad) the sheet's x axis is from pointing right."""
+    right = _axes(grid, places, seen)[:, 0]
+    return abs(math.atan2(right[1], right[0]))
+
+
+def _why(cells: dict[Cell, int], blobs: _Blobs, wanted: list[Cell], shape: tuple[int, ...]) -> str:
+    """What the largest lattice that was seen has of the pattern, in words."""
+    if len(cells) < max(6, 0.3 * len(wanted)):
+        return "no grid of dark circles was found"
+    places = blobs.places[list(cells.values())]
+    step = float(np.median(np.asarray(blobs.tree.query(places, 2)[0])[:, 1]))
+    low, high = places.min(0), places.max(0)
+    margin = np.concatenate([low, np.array(shape[1::-1]) - 1 - high])
+    if len(cells) < len(wanted) and margin.min() < BORDER_STEPS * step:
+        return (
+            f"only {len(cells)} of the grid's {len(wanted)} circles are in the picture: it is cropped, or has other "
+            "rows and columns"
+        )
+    if len(cells) < len(wanted):
+        return f"only {len(cells)} of the grid's {len(wanted)} circles were seen; the rest is hidden or too faint"
+    return (
+        f"a grid of {len(cells)} circles was seen that is not the pattern given ({len(wanted)} circles): "
+        "check kind, rows and columns, and that the picture is not mirrored"
+    )

@@ -1,0 +1,170 @@
+"""Where the sheet was in every photograph, and the intrinsics that make it so: depth is z along the axis, not a ray."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.calibration.target import CircleGrid
+from service.opencv import cv2
+from service.optics.camera import Intrinsics
+
+Array = NDArray[np.float64]
+
+BIAS_ROUNDS = 2
+RIM_POINTS = 48
+LEAST_VIEWS = 2
+FEW_VIEWS = 4
+LITTLE_TILT_DEG = 8.0
+BAD_RMS_PART = 0.05
+
+
+class PoseError(Exception):
+    """Why the sheets cannot be placed, in words for the user."""
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """The centres [k, 2] (px) of those circles of the grid, by number, that were measured in one photograph."""
+
+    circles: NDArray[np.int64]
+    centres_px: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """The camera, and for each view the circles' depth z [k] in metres, the sheet's tilt, and what is left over in px.
+
+    ``focal_error`` is the relative standard error of the focal length: all depths are wrong together by it.
+    """
+
+    intrinsics: Intrinsics
+    depth_m: tuple[Array, ...]
+    distance_m: tuple[float, ...]
+    tilt_deg: tuple[float, ...]
+    rms_px: tuple[float, ...]
+    overall_rms_px: float
+    focal_error: float
+    warnings: tuple[str, ...]
+
+
+def place(grid: CircleGrid, views: Sequence[View], size_px: tuple[int, int]) -> Placement:
+    """Intrinsics and poses of the views of one camera with pictures of ``size_px`` (width, height).
+
+    What an imaged circle's middle is off from its centre's image under perspective is taken out. Raises ``PoseError``
+    if there is nothing to place.
+    """
+    if len(views) < LEAST_VIEWS:
+        raise PoseError(
+            f"{len(views)} photograph{' shows' if len(views) == 1 else 's show'} the grid well enough; {LEAST_VIEWS} "
+            f"are the least from which a focal length, and so a distance, can be had, {FEW_VIEWS} or more are better"
+        )
+    board = np.column_stack([grid.points_mm(), np.zeros(grid.rows * grid.columns)])
+    centres = [view.centres_px for view in views]
+    for _ in range(BIAS_ROUNDS):
+        solved = _solved(board, views, centres, size_px)
+        centres = [view.centres_px - _bias(board, grid, view, solved, i) for i, view in enumerate(views)]
+    solved = _solved(board, views, centres, size_px)
+    turns = [np.asarray(cv2.Rodrigues(turn)[0]) for turn in solved.turns]
+    depths = [
+        np.asarray((board[view.circles] @ turn.T)[:, 2] + float(shift[2, 0]), np.float64) / 1e3
+        for view, turn, shift in zip(views, turns, solved.shifts, strict=True)
+    ]
+    middle = board.mean(0)
+    tilts = [float(np.degrees(np.arccos(min(abs(turn[2, 2]), 1.0)))) for turn in turns]
+    matrix = solved.matrix
+    return Placement(
+        Intrinsics(
+            float(matrix[0, 0]),
+            float(matrix[1, 1]),
+            float(matrix[0, 2]),
+            float(matrix[1, 2]),
+            tuple(solved.distortion.ravel().tolist()),
+        ),
+        tuple(depths),
+        tuple(float((turn @ middle)[2] + shift[2, 0]) / 1e3 for turn, shift in zip(turns, solved.shifts, strict=True)),
+        tuple(tilts),
+        tuple(solved.errors.tolist()),
+        solved.rms,
+        solved.focal_error,
+        tuple(_warnings(grid, views, solved, tilts)),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Solved:
+    rms: float
+    matrix: Array
+    distortion: Array
+    turns: tuple[Array, ...]
+    shifts: tuple[Array, ...]
+    errors: Array
+    focal_error: float
+
+
+def _solved(board: Array, views: Sequence[View], centres: Sequence[Array], size_px: tuple[int, int]) -> _Solved:
+    flags = cv2.CALIB_FIX_K3
+    if len(views) < FEW_VIEWS:
+        flags |= cv2.CALIB_FIX_K2 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_ASPECT_RATIO
+        flags |= cv2.CALIB_FIX_PRINCIPAL_POINT
+    start = np.array([[max(size_px), 0, (size_px[0] - 1) / 2], [0, max(size_px), (size_px[1] - 1) / 2], [0, 0, 1]])
+    if len(views) < FEW_VIEWS:
+        flags |= cv2.CALIB_USE_INTRINSIC_GUESS
+    try:
+        rms, matrix, distortion, turns, shifts, deviations, _, errors = cv2.calibrateCameraExtended(
+            [board[view.circles].astype(np.float32) for view in views],
+            [np.asarray(places, np.float32)[:, None] for places in centres],
+            size_px,
+            start.astype(np.float64),
+            np.zeros(5),
+            flags=flags,
+            criteria=(cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-10),
+        )
+    except cv2.error as error:
+        raise PoseError("the sheets cannot be placed: no camera would see the grid like that") from error
+    return _Solved(
+        float(rms),
+        np.asarray(matrix, np.float64),
+        np.asarray(distortion, np.float64),
+        tuple(np.asarray(turn, np.float64) for turn in turns),
+        tuple(np.asarray(shift, np.float64) for shift in shifts),
+        np.asarray(errors, np.float64).ravel(),
+        float(np.ravel(deviations)[:2].max() / matrix[0, 0]),
+    )
+
+
+def _bias(board: Array, grid: CircleGrid, view: View, solved: _Solved, number: int) -> Array:
+    """How far [k, 2] the middle of each circle's image is from the image of its centre, in px."""
+    angle = np.arange(RIM_POINTS) * (2 * np.pi / RIM_POINTS)
+    rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(RIM_POINTS)], 1) * grid.diameter_mm / 2
+    centres = board[view.circles]
+    points = np.concatenate([centres, (centres[:, None] + rim).reshape(-1, 3)])
+    seen, _ = cv2.projectPoints(points, solved.turns[number], solved.shifts[number], solved.matrix, solved.distortion)
+    flat = np.asarray(seen, np.float64).reshape(-1, 2)
+    outlines = flat[len(centres) :].reshape(-1, RIM_POINTS, 2) - flat[: len(centres), None]
+    after = np.roll(outlines, -1, axis=1)
+    cross = outlines[..., 0] * after[..., 1] - outlines[..., 1] * after[..., 0]
+    # the centroid of the outline's polygon, from the centre's image
+    return np.asarray(((outlines + after) * cross[..., None]).sum(1) / (3 * cross.sum(1))[:, None])
+
+
+def _warnings(grid: CircleGrid, views: Sequence[View], solved: _Solved, tilts: list[float]) -> list[str]:
+    told = []
+    if len(views) < FEW_VIEWS:
+        told.append(
+            f"{len(views)} usable photographs: the focal length, and with it every distance, is uncertain; take "
+            f"{FEW_VIEWS} or more"
+        )
+    if max(tilts) < LITTLE_TILT_DEG:
+        told.append(
+            f"the sheet was never tilted by more than {max(tilts):.0f} degrees: focal length and distance cannot be "
+            "told apart well; tilt it by 15 to 25 degrees"
+        )
+    size = np.median([np.ptp(view.centres_px, axis=0).max() for view in views]) / max(grid.rows, grid.columns)
+    if solved.rms > BAD_RMS_PART * size:
+        told.append(
+            f"the circles are {solved.rms:.1f} px off where one camera would see them: check the pattern's numbers, "
+            "that the sheet is flat, and that all pictures are from one camera with one zoom"
+        )
+    return told

@@ -1,0 +1,115 @@
+"""The grid found: in the sample photographs drawn here, sharp, blurred, turned, cropped and misnamed."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from service.calibration.grid import GridError, find_grid
+from service.calibration.target import CircleGrid
+
+TALL = CircleGrid("asymmetric_circles", 11, 4, 20.0, 14.0)
+SQUARE = CircleGrid("symmetric_circles", 7, 7, 20.0, 9.0)
+WIDE, HIGH = 900, 700
+
+
+def view(grid: CircleGrid, *, turn_deg: float = 0.0, lean: float = 0.0, px_per_mm: float = 2.2) -> NDArray[np.float64]:
+    """A homography [3,3] from millimetres on the sheet to pixels, the grid's middle in the picture's."""
+    middle = grid.points_mm().mean(0)
+    c, s = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
+    centred = np.array([[1, 0, -middle[0]], [0, 1, -middle[1]], [0, 0, 1.0]])
+    turned = np.array([[c, -s, 0], [s, c, 0], [lean / 1000, 0, 1]])
+    return np.array([[px_per_mm, 0, WIDE / 2], [0, px_per_mm, HIGH / 2], [0, 0, 1]]) @ turned @ centred
+
+
+def drawn(grid: CircleGrid, matrix: NDArray[np.float64], *, fine: int = 4) -> NDArray[np.uint8]:
+    """Black circles on white, each where the homography takes it, on a busy table."""
+    canvas = np.full((HIGH * fine, WIDE * fine), 225, np.uint8)
+    rng = np.random.default_rng(0)
+    for x, y, w, h in rng.integers(0, 160, (40, 4)) * fine:
+        cv2.rectangle(canvas, (int(x) // 4, int(y)), (int(x + w) // 4, int(y + h)), int(rng.integers(0, 255)), -1)
+    angle = np.linspace(0, 2 * np.pi, 90)
+    rim = np.stack([np.cos(angle), np.sin(angle)], 1) * grid.diameter_mm / 2
+    for centre in grid.points_mm():
+        through = np.column_stack([centre + rim, np.ones(len(rim))]) @ matrix.T
+        outline = (through[:, :2] / through[:, 2:] + 0.5) * fine
+        cv2.fillPoly(canvas, [outline.astype(np.int32)], 25)
+    return np.asarray(cv2.resize(canvas, (WIDE, HIGH), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def centres(grid: CircleGrid, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    through = np.column_stack([grid.points_mm(), np.ones(grid.rows * grid.columns)]) @ matrix.T
+    return np.asarray(through[:, :2] / through[:, 2:])
+
+
+@pytest.mark.parametrize("turn_deg", [0, 35, 90, 180, 250])
+def test_every_circle_is_found_and_named_in_any_turn(turn_deg: float) -> None:
+    matrix = view(TALL, turn_deg=turn_deg, lean=0.5)
+    found = find_grid(drawn(TALL, matrix), TALL)
+    assert found.seen.all()
+    assert np.abs(found.centres_px - centres(TALL, matrix)).max() < 1.0
+    assert found.radii_px.mean() == pytest.approx(2.2 * 7, rel=0.1)
+
+
+def test_a_symmetric_grid_begins_at_its_upper_left() -> None:
+    matrix = view(SQUARE, turn_deg=12)
+    assert np.abs(find_grid(drawn(SQUARE, matrix), SQUARE).centres_px - centres(SQUARE, matrix)).max() < 1.0
+    upside_down = view(SQUARE, turn_deg=192)
+    assert np.abs(find_grid(drawn(SQUARE, upside_down), SQUARE).centres_px - centres(SQUARE, matrix)).max() < 1.0
+
+
+@pytest.mark.parametrize("blur_part", [0.2, 0.4])
+def test_blur_of_a_third_of_the_radius_hides_nothing(blur_part: float) -> None:
+    matrix = view(TALL, turn_deg=15, lean=0.4)
+    sigma = blur_part * 7 * 2.2
+    found = find_grid(np.asarray(cv2.GaussianBlur(drawn(TALL, matrix), (0, 0), sigma), np.uint8), TALL)
+    assert np.abs(found.centres_px - centres(TALL, matrix)).max() < 0.1 * 7 * 2.2
+
+
+def test_a_hidden_circle_is_filled_in_and_said_so() -> None:
+    matrix = view(TALL)
+    picture = drawn(TALL, matrix)
+    x, y = centres(TALL, matrix)[21].astype(int)
+    cv2.rectangle(picture, (int(x) - 18, int(y) - 18), (int(x) + 18, int(y) + 18), 225, -1)
+    found = find_grid(picture, TALL)
+    assert np.flatnonzero(~found.seen).tolist() == [21]
+    assert np.abs(found.centres_px[21] - centres(TALL, matrix)[21]).max() < 1.0
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        CircleGrid("asymmetric_circles", 10, 4, 20.0, 14.0),
+        CircleGrid("asymmetric_circles", 4, 11, 20.0, 14.0),
+        CircleGrid("asymmetric_circles", 12, 4, 20.0, 14.0),
+        CircleGrid("symmetric_circles", 11, 4, 20.0, 14.0),
+    ],
+)
+def test_another_pattern_than_the_one_given_is_refused(wrong: CircleGrid) -> None:
+    with pytest.raises(GridError, match=r"rows.and columns|rows and"):
+        find_grid(drawn(TALL, view(TALL)), wrong)
+
+
+def test_a_mirrored_grid_of_even_rows_is_refused() -> None:
+    even = CircleGrid("asymmetric_circles", 10, 4, 20.0, 14.0)
+    picture = drawn(even, view(even, turn_deg=10))
+    assert find_grid(picture, even).seen.all()
+    with pytest.raises(GridError, match="mirrored"):
+        find_grid(np.ascontiguousarray(picture[:, ::-1]), even)
+
+
+def test_a_cropped_grid_says_how_much_is_there() -> None:
+    picture = drawn(TALL, view(TALL))
+    edge = int(centres(TALL, view(TALL))[-1, 1]) - 60
+    with pytest.raises(GridError, match=r"\d\d of the grid's 44 circles"):
+        find_grid(np.ascontiguousarray(picture[:edge]), TALL)
+
+
+def test_small_circles_are_too_small_and_nothing_is_nothing() -> None:
+    small = cv2.resize(drawn(TALL, view(TALL)), None, fx=0.17, fy=0.17, interpolation=cv2.INTER_AREA)
+    with pytest.raises(GridError):
+        find_grid(np.asarray(small, np.uint8), TALL)
+    with pytest.raises(GridError, match="no grid"):
+        find_grid(np.full((400, 500), 128, np.uint8), TALL)
