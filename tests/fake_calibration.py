@@ -46,6 +46,10 @@ class FakeCalibration:
         if not is_held:
             self.go.set()
 
+    def release_after(self, seconds: float) -> None:
+        """Let it go on later, from another thread."""
+        threading.Timer(seconds, self.go.set).start()
+
     def __call__(
         self,
         task: Task,
