@@ -168,7 +168,9 @@ class Calibrations:
             return set(session.exec(query))
 
     def take(self, spool: str) -> CalibrationRecord | None:
-        """The spool's next in line, now running; None where nothing waits."""
+        """The spool's next in line, now running; None where nothing waits, which costs no lock."""
+        if not self.waiting(spool):
+            return None
         query = (
             select(CalibrationRow)
             .where(col(CalibrationRow.spool) == spool, col(CalibrationRow.state) == "queued")
