@@ -8,17 +8,23 @@ from importlib.metadata import version
 from fastapi import FastAPI
 from fastapi_offline import FastAPIOffline
 
-from service.api import cameras, depth, handlers, health, metrics, model, openapi, pages, target
+from service.api import calibrations, cameras, depth, handlers, health, metrics, model, openapi, pages, target
+from service.calibration.calibrate import calibrate
 from service.config import Settings
 from service.inference.artifact import load_model_folder
 from service.inference.estimator import Estimator
+from service.inference.images import ImageLimits
 from service.inference.worker import Worker
-from service.middleware import AnswerHead, LimitRequests, ObserveRequests
+from service.middleware import AnswerHead, BodyLimits, LimitRequests, ObserveRequests
+from service.runner import Calibrate, Runner
 from service.storage import schema
+from service.storage.calibrations import Calibrations
 from service.storage.cameras import Cameras
 from service.storage.engine import open_engine
+from service.storage.spool import Spool
 
 DEPTH_PATH = "/depth"
+CALIBRATE_PATH = "/calibrate"
 DESCRIPTION = """\
 How far away is each pixel of this single photograph, in metres, given the camera that took it?
 Register a camera once, from its k_cam or its lens specs, and send photographs: no training is needed.
@@ -32,7 +38,7 @@ TAGS = [
 ]
 
 
-def create_app(settings: Settings) -> FastAPI:
+def create_app(settings: Settings, calibrate: Calibrate = calibrate) -> FastAPI:
     """The app for these settings; nothing is opened or loaded before it starts."""
     app = FastAPIOffline(
         title="camind",
@@ -47,9 +53,11 @@ def create_app(settings: Settings) -> FastAPI:
     )
     app.state.settings = settings
     app.state.metrics = metrics.Metrics()
+    app.state.calibrate = calibrate
+    app.state.is_stopping = False
     _add_middleware(app, settings)
     handlers.install(app)
-    for part in (cameras, depth, target, model, health, metrics, pages):
+    for part in (cameras, depth, calibrations, target, model, health, metrics, pages):
         app.include_router(part.router)
     app.openapi = lambda: openapi.describe(app)  # type: ignore[method-assign]
     return app
@@ -59,9 +67,11 @@ def _add_middleware(app: FastAPI, settings: Settings) -> None:
     # the last one added is the outermost
     app.add_middleware(
         LimitRequests,
-        max_bytes=settings.max_json_bytes,
-        max_bytes_by_path={DEPTH_PATH: settings.max_image_bytes},
-        deadline_s=settings.receive_deadline_s,
+        limits=BodyLimits(settings.max_json_bytes, settings.receive_deadline_s),
+        limits_by_path={
+            DEPTH_PATH: BodyLimits(settings.max_image_bytes, settings.receive_deadline_s),
+            CALIBRATE_PATH: BodyLimits(settings.max_calibration_bytes, settings.calibration_receive_deadline_s),
+        },
     )
     app.add_middleware(AnswerHead)
     app.add_middleware(ObserveRequests, metrics=app.state.metrics)
@@ -91,11 +101,21 @@ def _start(app: FastAPI) -> None:
     app.state.worker = Worker(
         slots=settings.worker_slots, queue_size=settings.queue_size, deadline_s=settings.deadline_s
     )
+    app.state.calibrations = Calibrations(engine)
+    app.state.spool = Spool(settings.spool_dir)
+    app.state.runner = Runner(
+        app.state.calibrations,
+        app.state.spool,
+        ImageLimits(settings.max_image_bytes, settings.max_image_pixels),
+        app.state.calibrate,
+    )
+    app.state.runner.start()
     app.state.metrics.in_flight.set_function(lambda: app.state.worker.in_flight)
     app.state.is_warm = True
 
 
 def _stop(app: FastAPI) -> None:
     app.state.is_warm = False
+    app.state.runner.close()
     app.state.worker.close()
     app.state.engine.dispose()

@@ -59,6 +59,16 @@ class Settings(BaseSettings):
     max_image_pixels: Annotated[int, Field(ge=1_000, le=100_000_000, description="Largest image, width x height")] = (
         24_000_000
     )
+    max_calibration_images: Annotated[int, Field(ge=1, le=1_000, description="Most photographs of one calibration")] = (
+        100
+    )
+    max_calibration_bytes: Annotated[
+        int, Field(ge=1_000, le=10_000_000_000, description="Largest request body with a calibration's photographs")
+    ] = 1_000_000_000
+    calibration_queue_size: Annotated[int, Field(ge=1, le=1_000, description="Calibrations that may wait")] = 8
+    calibration_receive_deadline_s: Annotated[
+        float, Field(gt=0, le=3_600, description="Longest time for the body of a calibration")
+    ] = 600.0
     max_json_bytes: Annotated[
         int, Field(ge=1_000, le=10_000_000, description="Largest request body without an image")
     ] = 64_000
@@ -102,6 +112,11 @@ class Settings(BaseSettings):
     def effective_database_url(self) -> str:
         """The database's URL, the default file in the data folder filled in."""
         return self.database_url or f"sqlite:///{self.data_dir.expanduser().resolve() / DATABASE_FILE}"
+
+    @property
+    def spool_dir(self) -> Path:
+        """Where photographs lie until their calibration ends."""
+        return self.data_dir.expanduser().resolve() / "calibrations"
 
     @property
     def is_database_embedded(self) -> bool:

@@ -102,10 +102,16 @@ class AnswerHead:
             await self._app(scope, receive, send)
             return
 
+        is_answered = False
+
         async def bodiless(message: Message) -> None:
+            nonlocal is_answered
             if message["type"] == "http.response.body":
-                message = {**message, "body": b""}
-            await send(message)
+                # at once: the body of an event stream may take minutes to end
+                message = {**message, "body": b"", "more_body": False}
+            if not is_answered:
+                await send(message)
+            is_answered = message["type"] == "http.response.body"
 
         inner = {**scope, "method": "GET"}
         try:
@@ -114,37 +120,43 @@ class AnswerHead:
             _hand_back(inner, scope)
 
 
+@dataclass(frozen=True, slots=True)
+class BodyLimits:
+    """The most bytes a body may have, and the longest it may take to arrive."""
+
+    max_bytes: int
+    deadline_s: float
+
+
 class LimitRequests:
     """Refuses bodies that are too large, by their stated length or by what comes, or that come too slowly.
 
-    ``max_bytes_by_path`` overrides ``max_bytes`` for single paths. Raises ``TooLarge``, ``ReceiveTimeout``.
+    ``limits_by_path`` overrides ``limits`` for single paths. Raises ``TooLarge``, ``ReceiveTimeout``.
     """
 
-    def __init__(self, app: ASGIApp, max_bytes: int, max_bytes_by_path: Mapping[str, int], deadline_s: float) -> None:
+    def __init__(self, app: ASGIApp, limits: BodyLimits, limits_by_path: Mapping[str, BodyLimits]) -> None:
         self._app = app
-        self._max_bytes = max_bytes
-        self._max_bytes_by_path = max_bytes_by_path
-        self._deadline_s = deadline_s
+        self._limits = limits
+        self._limits_by_path = limits_by_path
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        limit = self._max_bytes_by_path.get(scope["path"], self._max_bytes)
+        limits = self._limits_by_path.get(scope["path"], self._limits)
         stated = Headers(scope=scope).get("content-length", "")
-        if stated.isdecimal() and int(stated[:20]) > limit:
-            raise _too_large(limit)
-        await self._app(scope, _LimitedBody(receive, limit, self._deadline_s), send)
+        if stated.isdecimal() and int(stated[:20]) > limits.max_bytes:
+            raise _too_large(limits.max_bytes)
+        await self._app(scope, _LimitedBody(receive, limits), send)
 
 
 class _LimitedBody:
     """``receive`` with a count and a clock; both end with the body, for later messages mean a disconnect."""
 
-    def __init__(self, receive: Receive, limit: int, deadline_s: float) -> None:
+    def __init__(self, receive: Receive, limits: BodyLimits) -> None:
         self._receive = receive
-        self._limit = limit
-        self._deadline_s = deadline_s
-        self._ends_at_s = time.monotonic() + deadline_s
+        self._limits = limits
+        self._ends_at_s = time.monotonic() + limits.deadline_s
         self._received = 0
         self._is_whole = False
 
@@ -155,11 +167,11 @@ class _LimitedBody:
             async with asyncio.timeout(self._ends_at_s - time.monotonic()):
                 message = await self._receive()
         except TimeoutError as exc:
-            raise ReceiveTimeout(f"The request body did not arrive within {self._deadline_s:g} s.") from exc
+            raise ReceiveTimeout(f"The request body did not arrive within {self._limits.deadline_s:g} s.") from exc
         self._received += len(message.get("body", b""))
         self._is_whole = not message.get("more_body", False)
-        if self._received > self._limit:
-            raise _too_large(self._limit)
+        if self._received > self._limits.max_bytes:
+            raise _too_large(self._limits.max_bytes)
         return message
 
 

@@ -94,6 +94,18 @@ class DeadlineProtocol(H11Protocol):
         self.transport.close()
 
 
+class StoppingServer(uvicorn.Server):
+    """Tells the app that it stops before waiting for its answers: those that wait for something end then."""
+
+    def __init__(self, config: uvicorn.Config, app: FastAPI) -> None:
+        super().__init__(config)
+        self._app = app
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        self._app.state.is_stopping = True
+        await super().shutdown(sockets)
+
+
 def bind(host: str, port: int) -> socket.socket:
     """A listening socket. Raises ``PortTakenError``, before anything slow was loaded."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -121,6 +133,6 @@ def serve(app: FastAPI, settings: Settings, listener: socket.socket) -> bool:
         server_header=False,
         timeout_graceful_shutdown=int(settings.deadline_s) + 1,
     )
-    server = uvicorn.Server(config)
+    server = StoppingServer(config, app)
     server.run(sockets=[listener])
     return server.started

@@ -14,8 +14,13 @@ OPTICS = sorted((ROOT / "service" / "optics").rglob("*.py"))
 
 BLOCKED = """
 import sys
-for name in ("torch", "onnx", "onnxscript", "model_export"):
-    sys.modules[name] = None
+
+class Absent:
+    def find_spec(name, path=None, target=None):
+        if name in ("torch", "onnx", "onnxscript", "model_export"):
+            raise ModuleNotFoundError(name)
+
+sys.meta_path.insert(0, Absent)
 import service.app, service.cli
 assert "cv2" not in sys.modules or __import__("os").environ["OPENCV_IO_MAX_IMAGE_PIXELS"]
 """

@@ -11,6 +11,7 @@ import pytest
 import typer
 
 from service import cli
+from service.storage import schema
 
 CAMIND = Path(sys.executable).parent / "camind"
 
@@ -32,7 +33,7 @@ def test_seeds_are_stored_once_and_listed(tmp_path: Path) -> None:
 
 def test_migrate_says_where_the_database_is(tmp_path: Path) -> None:
     done = camind(tmp_path, "migrate")
-    assert (done.returncode, done.stdout) == (0, "The database is at 2026_11_21_cameras.\n")
+    assert (done.returncode, done.stdout) == (0, f"The database is at {schema.head_revision()}.\n")
 
 
 def test_the_version_is_the_package_s(tmp_path: Path) -> None:

@@ -14,8 +14,8 @@ def cursor_after(name: str) -> str:
     return urlsafe_b64encode(f"{PREFIX}{name}".encode()).decode().rstrip("=")
 
 
-def name_of(cursor: str | None) -> str | None:
-    """The name in a cursor, ``None`` for none. Raises ``BadRequest`` for a cursor that never was one."""
+def name_of(cursor: str | None, pattern: str = NAME_PATTERN) -> str | None:
+    """The name or id in a cursor, ``None`` for none. Raises ``BadRequest`` for a cursor that never was one."""
     if cursor is None:
         return None
     try:
@@ -23,7 +23,7 @@ def name_of(cursor: str | None) -> str | None:
     except ValueError:
         text = ""
     name = text.removeprefix(PREFIX)
-    if not text.startswith(PREFIX) or not re.fullmatch(NAME_PATTERN, name):
+    if not text.startswith(PREFIX) or not re.fullmatch(pattern, name):
         detail = "This cursor is none of ours: take next_cursor from the page before, or leave it out."
         raise BadRequest(f"cursor: {detail}", errors=(FieldProblem("cursor", detail),))
     return name

@@ -10,7 +10,10 @@ from service.errors import UnsupportedKind
 from service.inference.artifact import ModelFolder
 from service.inference.estimator import Estimator
 from service.inference.worker import Worker
+from service.runner import Runner
+from service.storage.calibrations import Calibrations
 from service.storage.cameras import Cameras
+from service.storage.spool import Spool
 
 
 def get_settings(request: Request) -> Settings:
@@ -38,6 +41,21 @@ def get_worker(request: Request) -> Worker:
     return worker
 
 
+def get_calibrations(request: Request) -> Calibrations:
+    calibrations: Calibrations = request.app.state.calibrations
+    return calibrations
+
+
+def get_spool(request: Request) -> Spool:
+    spool: Spool = request.app.state.spool
+    return spool
+
+
+def get_runner(request: Request) -> Runner:
+    runner: Runner = request.app.state.runner
+    return runner
+
+
 def get_metrics(request: Request) -> Metrics:
     metrics: Metrics = request.app.state.metrics
     return metrics
@@ -56,4 +74,7 @@ CamerasDep = Annotated[Cameras, Depends(get_cameras)]
 ModelDep = Annotated[ModelFolder, Depends(get_model)]
 EstimatorDep = Annotated[Estimator, Depends(get_estimator)]
 WorkerDep = Annotated[Worker, Depends(get_worker)]
+CalibrationsDep = Annotated[Calibrations, Depends(get_calibrations)]
+SpoolDep = Annotated[Spool, Depends(get_spool)]
+RunnerDep = Annotated[Runner, Depends(get_runner)]
 MetricsDep = Annotated[Metrics, Depends(get_metrics)]

@@ -1,7 +1,7 @@
 """The only door for photographs: bytes in, upright RGB out.
 
 Kind, size and wholeness are decided on the header, before anything is decoded. EXIF orientation is applied
-here and nowhere else.
+here and nowhere else; a calibration, which measures the lens, asks for the stored frame.
 """
 
 from dataclasses import dataclass
@@ -73,19 +73,19 @@ def read_photograph(data: bytes, media_type: str | None = None, limits: ImageLim
     Raises ``InvalidImage`` (empty, cut off, damaged), ``TooLarge`` (before decoding) and ``UnsupportedKind``
     (a declared type or bytes that are not listed).
     """
-    limits = limits or ImageLimits()
     declared = declared_kind(media_type)
-    if not data:
-        raise InvalidImage("The body is empty: send the bytes of one photograph.")
-    if len(data) > limits.max_bytes:
-        raise TooLarge(f"The file has {len(data)} bytes, more than the {limits.max_bytes} accepted.")
-    kind = sniff(data)
-    if kind is None:
-        raise UnsupportedKind("The bytes are none of JPEG, PNG, TIFF, WebP and HEIC.")
-    stored, orientation = _decode_heic(data, limits) if kind == "heic" else _decode(data, limits)
+    kind, stored, orientation = _read(data, limits or ImageLimits())
     warnings = (f"declared {media_type}, read as {kind}",) if declared not in (None, kind) else ()
     height, width = stored.shape[:2]
     return Photograph(turned(stored, orientation), kind, orientation, width, height, warnings)
+
+
+def read_stored_frame(data: bytes, limits: ImageLimits | None = None) -> NDArray[np.uint8]:
+    """The pixels [h, w, 3] RGB as the sensor had them, orientation not applied: a lens belongs to its sensor.
+
+    A HEIC comes upright all the same, for its decoder turns it. Raises as ``read_photograph`` does.
+    """
+    return _read(data, limits or ImageLimits())[1]
 
 
 def turned(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
@@ -108,6 +108,18 @@ def declared_kind(media_type: str | None) -> Kind | None:
     if name not in MEDIA_TYPES:
         raise UnsupportedKind(f"{name[:100]} is no photograph: send one of {', '.join(MEDIA_TYPES)}.")
     return MEDIA_TYPES[name]
+
+
+def _read(data: bytes, limits: ImageLimits) -> tuple[Kind, NDArray[np.uint8], int]:
+    if not data:
+        raise InvalidImage("The file is empty: send the bytes of one photograph.")
+    if len(data) > limits.max_bytes:
+        raise TooLarge(f"The file has {len(data)} bytes, more than the {limits.max_bytes} accepted.")
+    kind = sniff(data)
+    if kind is None:
+        raise UnsupportedKind("The bytes are none of JPEG, PNG, TIFF, WebP and HEIC.")
+    stored, orientation = _decode_heic(data, limits) if kind == "heic" else _decode(data, limits)
+    return kind, stored, orientation
 
 
 def _require_pixels(width_px: int, height_px: int, limits: ImageLimits) -> None:

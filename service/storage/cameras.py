@@ -122,6 +122,21 @@ class Cameras:
             session.add(row)
 
 
+def store_calibrated(session: Session, name: str, camera: Camera) -> CameraRecord:
+    """Make the camera, or give it a new revision, with constants from a calibration; the description stays.
+
+    For a caller's own transaction: an ``IntegrityError`` means that another process just made the name.
+    """
+    now = datetime.now(UTC)
+    row = _find_row(session, name, lock=True)
+    if row is None or row.deleted_at is not None:
+        row = row or CameraRow(name=name, revision=0, created_at=now, updated_at=now)
+        row.created_at, row.deleted_at, description = now, None, None
+    else:
+        description = _current(session, name)[1].description
+    return _write_revision(session, row, CameraDraft(name, camera, "calibration", description=description), now)
+
+
 def _taken(name: str) -> Conflict:
     return Conflict(f"A camera '{name}' exists already: replace it with PUT /cameras/{name}.")
 

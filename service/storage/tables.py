@@ -2,7 +2,8 @@
 
 from datetime import UTC, datetime
 
-from sqlalchemy import JSON, Column, DateTime, Dialect, MetaData, UniqueConstraint
+from pydantic import JsonValue
+from sqlalchemy import JSON, Column, DateTime, Dialect, MetaData, Text, UniqueConstraint
 from sqlalchemy.types import TypeDecorator
 from sqlmodel import Field, SQLModel
 
@@ -73,3 +74,28 @@ class CameraRevisionRow(SQLModel, table=True):
     cx_px: float | None = None
     cy_px: float | None = None
     distortion: list[float] | None = Field(default=None, sa_column=Column(JSON(none_as_null=True), nullable=True))
+
+
+class CalibrationRow(SQLModel, table=True):
+    """A calibration: what was asked, how far it is, and what came of it; kept when its photographs are gone."""
+
+    __tablename__ = "calibrations"
+    __table_args__ = (UniqueConstraint("id"),)
+
+    # the order they came in; clients know the id alone
+    number: int | None = Field(default=None, primary_key=True)
+    id: str = Field(max_length=32)
+    spool: str = Field(max_length=32)
+    camera: str = Field(max_length=64)
+    state: str = Field(max_length=16, index=True)
+    attempts: int
+    version: int
+    progress: float
+    created_at: datetime = Field(sa_type=UtcDateTime)
+    updated_at: datetime = Field(sa_type=UtcDateTime)
+    camera_revision: int | None = None
+    problem: str | None = Field(default=None, sa_type=Text)
+    settings: JsonValue = Field(sa_column=Column(JSON, nullable=False))
+    pictures: list[dict[str, str]] = Field(sa_column=Column(JSON, nullable=False))
+    images: JsonValue = Field(sa_column=Column(JSON, nullable=False))
+    result: JsonValue = Field(default=None, sa_column=Column(JSON(none_as_null=True), nullable=True))

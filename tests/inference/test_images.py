@@ -9,7 +9,7 @@ import pytest
 
 from service.errors import InvalidImage, TooLarge, UnsupportedKind
 from service.inference.headers import read_header
-from service.inference.images import TURNS, ImageLimits, read_photograph
+from service.inference.images import TURNS, ImageLimits, read_photograph, read_stored_frame
 from tests.inference.photographs import Order, corners, encoded, hostile_png, jpeg, png, tiff, webp
 
 MAKERS: dict[str, Callable[..., bytes]] = {"jpeg": jpeg, "png": png, "tiff": tiff, "webp": webp}
@@ -30,6 +30,22 @@ def test_orientation_is_applied_exactly_once(kind: str, orientation: int) -> Non
     found = (rgb[4, 4], rgb[4, -5], rgb[-5, 4], rgb[-5, -5])
     for pixel, letter in zip(found, UPRIGHT[orientation], strict=True):
         assert np.abs(pixel - COLOURS[letter]).max() <= 6
+
+
+@pytest.mark.parametrize("orientation", TURNS)
+@pytest.mark.parametrize("kind", MAKERS)
+def test_the_stored_frame_is_as_the_sensor_had_it(kind: str, orientation: int) -> None:
+    stored = read_stored_frame(MAKERS[kind](corners(), orientation))
+    np.testing.assert_array_equal(stored, read_photograph(MAKERS[kind](corners())).rgb)
+
+
+def test_the_stored_frame_has_the_same_limits() -> None:
+    with pytest.raises(TooLarge, match="64x48"):
+        read_stored_frame(png(corners()), ImageLimits(max_pixels=64 * 48 - 1))
+    with pytest.raises(InvalidImage, match="empty"):
+        read_stored_frame(b"")
+    with pytest.raises(UnsupportedKind):
+        read_stored_frame(b"hello, world")
 
 
 @pytest.mark.parametrize("orientation", [0, 9, 65535])

@@ -1,0 +1,202 @@
+"""Calibrations on the wire; what they found has the fields of ``service.calibration.report``."""
+
+from datetime import datetime
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from service.api.problems import invalid_request
+from service.api.schemas import Given, Name, PinholeIntrinsics
+from service.calibration.report import Method, Role
+from service.calibration.target import CircleGrid, Kind
+from service.errors import BadRequest, FieldProblem
+from service.storage.calibrations import CalibrationRecord, CalibrationSummary
+
+SETTINGS_FIELD = "settings"
+
+Circles = Annotated[int, Field(ge=2, le=40)]
+Millimetres = Annotated[float, Field(gt=0, le=1_000, allow_inf_nan=False)]
+State = Annotated[
+    Literal["queued", "running", "succeeded", "failed", "cancelled"],
+    Field(description="The last three are final"),
+]
+Progress = Annotated[float, Field(ge=0, le=1)]
+Problem = Annotated[str | None, Field(description="Why there is no result, once it has failed")]
+CameraRevision = Annotated[int | None, Field(description="The revision it gave the camera, where it registered one")]
+Utc = Annotated[datetime, Field(description="UTC")]
+
+
+class Pattern(Given):
+    """The printed grid of circles; its true sizes, for the camera's scale hangs on them."""
+
+    kind: Annotated[Kind, Field(description="Circle (row i, column j) stands at ((2j + i mod 2)s, is) or at (js, is)")]
+    rows: Circles
+    columns: Circles
+    spacing_mm: Annotated[Millimetres, Field(description="The spacing s of the grid, as printed")]
+    diameter_mm: Annotated[Millimetres, Field(description="Of each circle, as printed")]
+
+
+class CalibrationSettings(Given):
+    """What to look for in the photographs, and what to do with what is found."""
+
+    model_config = ConfigDict(
+        serialize_by_alias=True,
+        json_schema_extra={
+            "examples": [
+                {
+                    "pattern": {
+                        "kind": "asymmetric_circles",
+                        "rows": 11,
+                        "columns": 4,
+                        "spacing_mm": 20.0,
+                        "diameter_mm": 12.0,
+                    },
+                    "focus_distance_m": None,
+                    "method": "edge",
+                    "register": True,
+                }
+            ]
+        },
+    )
+
+    pattern: Pattern
+    focus_distance_m: Annotated[
+        float | None,
+        Field(ge=0.01, le=1_000, allow_inf_nan=False, description="Where the lens is focused; null: find it"),
+    ] = None
+    method: Annotated[Method, Field(description="How the blur of a circle is read")] = "edge"
+    # "register" is what every class of models can do already
+    is_to_register: Annotated[
+        bool, Field(alias="register", description="Store the camera, or its new revision, on success")
+    ] = False
+
+    @classmethod
+    def from_form(cls, raw: bytes) -> Self:
+        """The settings in a form's field. Raises ``BadRequest`` that points below the field."""
+        try:
+            settings = cls.model_validate_json(raw)
+        except ValidationError as exc:
+            raise invalid_request([_in_field(dict(fault)) for fault in exc.errors()]) from exc
+        settings.to_grid()
+        return settings
+
+    def to_grid(self) -> CircleGrid:
+        """The grid; ``BadRequest`` for circles that touch."""
+        given = self.pattern
+        try:
+            return CircleGrid(given.kind, given.rows, given.columns, given.spacing_mm, given.diameter_mm)
+        except ValueError as exc:
+            raise _fault("pattern/diameter_mm", f"No such grid can be printed: {exc}.") from exc
+
+
+class ImageRead(BaseModel):
+    """What one photograph gave; null where it is not known."""
+
+    name: Annotated[str, Field(description="The file's name, numbered where two were the same")]
+    role: Role
+    found: Annotated[bool, Field(description="Whether the grid was found")]
+    circles: Annotated[int, Field(description="Circles measured")]
+    blur_px: Annotated[float | None, Field(description="Median blur of its circles, a standard deviation")]
+    distance_m: Annotated[float | None, Field(description="Depth of the grid's middle, along the optical axis")]
+    tilt_deg: Annotated[float | None, Field(description="Between grid and sensor")]
+    warnings: list[str]
+
+
+class IntervalRead(BaseModel):
+    """A value and where it lies with a confidence of 95 %."""
+
+    value: float
+    low: float
+    high: float
+
+
+class SampleRead(BaseModel):
+    """One measured circle."""
+
+    circle: Annotated[int, Field(description="Its number in the grid, row by row")]
+    image: Annotated[str, Field(description="The photograph's name")]
+    depth_m: float
+    blur_px: float
+    blur_error_px: Annotated[float, Field(description="Standard error of `blur_px`")]
+    k_cam_px: Annotated[float | None, Field(description="What this circle alone says; null in the plane in focus")]
+    field: Annotated[float, Field(description="Distance from the principal point over half the image's diagonal")]
+    used: Annotated[bool, Field(description="False for an outlier")]
+
+
+class ResultRead(BaseModel):
+    """The camera's constants, in pixels of images of this size as the sensor has them, before EXIF orientation."""
+
+    image_width_px: int
+    image_height_px: int
+    k_cam_px: IntervalRead
+    gamma_px: IntervalRead
+    focus_distance_m: Annotated[IntervalRead, Field(description="Of no width where it was given")]
+    intrinsics: PinholeIntrinsics
+    reprojection_rms_px: Annotated[float, Field(description="How well the circles' places fit the lens")]
+    samples: list[SampleRead]
+    warnings: list[str]
+
+
+class CalibrationItem(BaseModel):
+    """A calibration in a list."""
+
+    id: str
+    camera: Name
+    state: State
+    progress: Progress
+    problem: Problem
+    camera_revision: CameraRevision
+    created_at: Utc
+    updated_at: Utc
+
+    @classmethod
+    def from_summary(cls, summary: CalibrationSummary) -> Self:
+        """The stored summary as it is."""
+        return cls.model_validate(summary, from_attributes=True)
+
+
+class CalibrationPage(BaseModel):
+    """Calibrations, the newest first."""
+
+    items: list[CalibrationItem]
+    next_cursor: Annotated[str | None, Field(description="Pass it as `cursor` for the next page; null: the last")]
+
+
+class CalibrationRead(CalibrationItem):
+    """A calibration: how far it is, what each photograph gave so far, and the result once it has succeeded."""
+
+    model_config = ConfigDict(serialize_by_alias=True)
+
+    settings: CalibrationSettings
+    images: Annotated[list[ImageRead], Field(description="The photographs looked at so far")]
+    result: ResultRead | None
+
+    @classmethod
+    def from_record(cls, record: CalibrationRecord) -> Self:
+        """The stored calibration."""
+        return cls.model_validate(
+            {
+                "id": record.id,
+                "camera": record.draft.camera,
+                "state": record.state,
+                "progress": record.progress,
+                "problem": record.problem,
+                "camera_revision": record.camera_revision,
+                "created_at": record.created_at,
+                "updated_at": record.updated_at,
+                "settings": record.draft.settings,
+                "images": record.images,
+                "result": record.result,
+            }
+        )
+
+
+def _in_field(fault: dict[str, object]) -> dict[str, object]:
+    path = fault["loc"] if isinstance(fault["loc"], tuple) else ()
+    # JSON that is none has its place in its message: elsewhere it would point to the whole body
+    kind = "json" if fault["type"] == "json_invalid" else fault["type"]
+    return {**fault, "type": kind, "loc": ("body", SETTINGS_FIELD, *path)}
+
+
+def _fault(place: str, detail: str) -> BadRequest:
+    return BadRequest(detail, errors=(FieldProblem(f"#/{SETTINGS_FIELD}/{place}", detail),))

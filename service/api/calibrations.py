@@ -1,0 +1,253 @@
+"""``POST /calibrate`` and ``/calibrations``: photographs of the printed grid in, a camera's constants out."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import suppress
+from typing import Annotated
+from uuid import uuid4
+
+from fastapi import APIRouter, Depends, FastAPI, Header, Path, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+from starlette.requests import ClientDisconnect
+
+from service.api.calibration_schemas import (
+    SETTINGS_FIELD,
+    CalibrationItem,
+    CalibrationPage,
+    CalibrationRead,
+    CalibrationSettings,
+)
+from service.api.calibration_uploads import DEFOCUSED, FOCUSED, FormLimits, receive_form
+from service.api.cursors import cursor_after, name_of
+from service.api.dependencies import CalibrationsDep, RunnerDep, SettingsDep, SpoolDep
+from service.api.openapi import REF
+from service.api.preferences import MOST_WAIT_S, wait_of
+from service.api.problems import responses
+from service.api.schemas import Name
+from service.api.uploads import MULTIPART
+from service.calibration.plot import as_svg
+from service.errors import (
+    BadRequest,
+    Busy,
+    Conflict,
+    InvalidImage,
+    NotFound,
+    NotReady,
+    TooLarge,
+    UnsupportedKind,
+)
+from service.runner import RESULT
+from service.storage.calibrations import ID_PATTERN, CalibrationDraft, CalibrationRecord, Calibrations
+from service.storage.spool import Spool
+
+STORE_ERRORS = (Busy, NotReady)
+CLIENT_CLOSED_REQUEST = 499
+LOOK_S = 0.2
+RETRY_AFTER_S = 30
+HEADERS = {
+    "Location": {"description": "The calibration's path", "schema": {"type": "string"}},
+    "Preference-Applied": {"description": "The wait that was granted", "schema": {"type": "string"}},
+}
+# the schema among the components is that of an answer, where nothing is left out
+SETTINGS_SCHEMA = CalibrationSettings.model_json_schema(ref_template=REF)
+del SETTINGS_SCHEMA["$defs"]
+FILES = {"type": "array", "items": {"type": "string", "format": "binary"}}
+
+router = APIRouter(tags=["calibration"])
+
+
+CalibrationId = Annotated[str, Path(alias="id")]
+
+
+def _find(calibration_id: CalibrationId, calibrations: CalibrationsDep) -> CalibrationRecord:
+    return calibrations.get(calibration_id)
+
+
+FoundDep = Annotated[CalibrationRecord, Depends(_find)]
+
+
+@router.post(
+    "/calibrate",
+    operation_id="createCalibration",
+    status_code=202,
+    response_model=CalibrationRead,
+    summary="Calibrate a camera from photographs of the printed grid",
+    responses={
+        200: {"model": CalibrationRead, "description": "It ended within the wait", "headers": HEADERS},
+        202: {"description": "It is queued", "headers": HEADERS},
+        **responses(BadRequest, InvalidImage, TooLarge, UnsupportedKind, *STORE_ERRORS),
+    },
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {
+                MULTIPART: {
+                    "schema": {
+                        "type": "object",
+                        "required": [SETTINGS_FIELD, DEFOCUSED],
+                        "additionalProperties": False,
+                        "properties": {
+                            SETTINGS_FIELD: SETTINGS_SCHEMA,
+                            FOCUSED: {**FILES, "description": "In focus: for the lens' geometry"},
+                            DEFOCUSED: {**FILES, "minItems": 1, "description": "Nearer and farther than the focus"},
+                        },
+                    },
+                    "encoding": {SETTINGS_FIELD: {"contentType": "application/json"}},
+                }
+            },
+        }
+    },
+)
+async def create_calibration(
+    request: Request,
+    response: Response,
+    camera: Annotated[Name, Query(description="The camera it is for; it need not be there yet")],
+    settings: SettingsDep,
+    calibrations: CalibrationsDep,
+    spool: SpoolDep,
+    runner: RunnerDep,
+    prefer: Annotated[
+        str | None, Header(description=f"`wait=SECONDS`, at most {MOST_WAIT_S}: answer when it has ended")
+    ] = None,
+) -> CalibrationRead | Response:
+    """Queue a calibration. It is worked on one at a time, survives a restart, and its photographs go when it ends."""
+    await _require_room(calibrations, spool, settings.calibration_queue_size)
+    limits = FormLimits(settings.max_calibration_images, settings.max_image_bytes, settings.max_json_bytes)
+    try:
+        record = await _received(request, camera, limits, calibrations, spool)
+    except ClientDisconnect:
+        return Response(status_code=CLIENT_CLOSED_REQUEST)
+    runner.wake()
+    response.headers["Location"] = f"/calibrations/{record.id}"
+    wait_s = wait_of(prefer)
+    if wait_s is not None:
+        record = await _waited(request.app, calibrations, record, wait_s)
+        response.headers["Preference-Applied"] = f"wait={wait_s}"
+        response.status_code = 200 if record.has_ended else 202
+    return CalibrationRead.from_record(record)
+
+
+@router.get(
+    "/calibrations",
+    operation_id="listCalibrations",
+    summary="List calibrations, the newest first",
+    responses=responses(BadRequest, *STORE_ERRORS),
+)
+def list_calibrations(
+    calibrations: CalibrationsDep,
+    limit: Annotated[int, Query(ge=1, le=200)] = 50,
+    cursor: Annotated[str | None, Query(max_length=200, description="`next_cursor` of the page before")] = None,
+) -> CalibrationPage:
+    """Calibrations a page at a time, without images and results."""
+    summaries, has_more = calibrations.page(limit, name_of(cursor, ID_PATTERN))
+    return CalibrationPage(
+        items=[CalibrationItem.from_summary(summary) for summary in summaries],
+        next_cursor=cursor_after(summaries[-1].id) if has_more else None,
+    )
+
+
+@router.get(
+    "/calibrations/{id}",
+    operation_id="readCalibration",
+    summary="Read a calibration",
+    responses=responses(NotFound, *STORE_ERRORS),
+)
+def read_calibration(record: FoundDep) -> CalibrationRead:
+    """How far it is, what each photograph gave, and the result or the problem at its end."""
+    return CalibrationRead.from_record(record)
+
+
+@router.get(
+    "/calibrations/{id}/events",
+    operation_id="followCalibration",
+    summary="Follow a calibration",
+    response_class=EventSourceResponse,
+    responses=responses(NotFound, *STORE_ERRORS),
+)
+async def follow_calibration(
+    request: Request, record: FoundDep, calibrations: CalibrationsDep
+) -> AsyncIterator[ServerSentEvent]:
+    """The whole calibration as a server-sent event, now and after each change; the stream ends when it has ended."""
+    async for now in _changes(request.app, calibrations, record):
+        yield ServerSentEvent(data=CalibrationRead.from_record(now), id=str(now.version))
+
+
+@router.get(
+    "/calibrations/{id}/plot.svg",
+    operation_id="plotCalibration",
+    summary="Draw a calibration's result",
+    response_class=Response,
+    responses={200: {"content": {"image/svg+xml": {}}}, **responses(NotFound, Conflict, *STORE_ERRORS)},
+)
+def plot_calibration(record: FoundDep) -> Response:
+    """The measured circles and the curve through them."""
+    if record.result is None:
+        raise Conflict(f"This calibration is {record.state} and has no result: only one that succeeded has a plot.")
+    return Response(as_svg(RESULT.validate_python(record.result)), media_type="image/svg+xml")
+
+
+@router.delete(
+    "/calibrations/{id}",
+    operation_id="cancelCalibration",
+    status_code=204,
+    summary="Cancel a calibration",
+    responses=responses(NotFound, *STORE_ERRORS),
+)
+def cancel_calibration(
+    calibration_id: CalibrationId, calibrations: CalibrationsDep, spool: SpoolDep, runner: RunnerDep
+) -> None:
+    """Stop it and remove its photographs. It stays readable; one that has ended stays as it is."""
+    if calibrations.cancel(calibration_id) == "queued":
+        spool.remove(calibration_id)
+    runner.wake()
+
+
+async def _require_room(calibrations: Calibrations, spool: Spool, queue_size: int) -> None:
+    waiting = await run_in_threadpool(calibrations.waiting, spool.id)
+    if waiting + spool.incoming >= queue_size:
+        raise Busy(f"{queue_size} calibrations wait already: try again later.", retry_after_s=RETRY_AFTER_S)
+
+
+async def _received(
+    request: Request, camera: str, limits: FormLimits, calibrations: Calibrations, spool: Spool
+) -> CalibrationRecord:
+    """The calibration in a request's form, with its photographs on the disk and its row in the database."""
+    calibration_id = uuid4().hex
+    with spool.receiving(calibration_id) as folder:
+        form = await receive_form(request, folder, limits)
+        wanted = CalibrationSettings.from_form(form.settings)
+        draft = CalibrationDraft(calibration_id, spool.id, camera, wanted.model_dump(mode="json"), form.pictures)
+        return await run_in_threadpool(_store, calibrations, spool, draft)
+
+
+def _store(calibrations: Calibrations, spool: Spool, draft: CalibrationDraft) -> CalibrationRecord:
+    spool.seal(draft.id)
+    return calibrations.add(draft)
+
+
+async def _changes(
+    app: FastAPI, calibrations: Calibrations, record: CalibrationRecord
+) -> AsyncIterator[CalibrationRecord]:
+    """The calibration now, and again after each change until it has ended or the service stops.
+
+    Asked of the database, for the process that works on it may be another one.
+    """
+    yield record
+    while not (record.has_ended or app.state.is_stopping):
+        await asyncio.sleep(LOOK_S)
+        with suppress(Busy):
+            if await run_in_threadpool(calibrations.version, record.id) != record.version:
+                record = await run_in_threadpool(calibrations.get, record.id)
+                yield record
+
+
+async def _waited(
+    app: FastAPI, calibrations: Calibrations, record: CalibrationRecord, wait_s: int
+) -> CalibrationRecord:
+    """The calibration when it has ended, or as it is after the wait."""
+    with suppress(TimeoutError):
+        async with asyncio.timeout(wait_s):
+            async for now in _changes(app, calibrations, record):
+                record = now
+    return record

@@ -1,0 +1,240 @@
+"""The one thread that calibrates: takes what waits in the database, and brings every calibration to an end.
+
+A stop leaves the calibration in the queue, and a process that dies leaves it running: both are run again at the
+next start, the second three times at most, for some photographs may be what ends the process.
+"""
+
+import json
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+import numpy as np
+import structlog
+from numpy.typing import NDArray
+from pydantic import ConfigDict, JsonValue, TypeAdapter
+from pydantic.dataclasses import dataclass
+
+from service.calibration.calibrate import Picture, Task, calibrate
+from service.calibration.report import Method, PictureReport, Report, Result, Role
+from service.calibration.target import CircleGrid
+from service.errors import CamindError
+from service.inference.cancellation import Cancelled
+from service.inference.images import ImageLimits, read_stored_frame
+from service.optics.camera import Camera
+from service.storage.calibrations import CalibrationRecord, Calibrations, Ending
+from service.storage.spool import Spool
+
+T = TypeVar("T")
+
+MOST_ATTEMPTS = 3
+LOOK_S = 5.0
+WRITE_S = 1.0
+RETRY_S = 1.0
+CLOSE_S = 10.0
+
+log = structlog.stdlib.get_logger("camind.calibration")
+
+
+class Calibrate(Protocol):
+    """``service.calibration.calibrate.calibrate``, or what stands in for it."""
+
+    def __call__(
+        self,
+        task: Task,
+        pictures: Sequence[Picture],
+        *,
+        tell: Callable[[float, tuple[PictureReport, ...]], None],
+        check: Callable[[], None],
+    ) -> Report: ...
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class JobSettings:
+    """What a calibration is told, in the form it is stored."""
+
+    pattern: CircleGrid
+    focus_distance_m: float | None
+    method: Method
+    register: bool
+
+
+SETTINGS = TypeAdapter(JobSettings)
+ROLE: TypeAdapter[Role] = TypeAdapter(Role)
+REPORTS = TypeAdapter(tuple[PictureReport, ...])
+RESULT = TypeAdapter(Result)
+
+
+class Runner:
+    """Works a spool off in a thread of its own, between ``start`` and ``close``."""
+
+    def __init__(
+        self, calibrations: Calibrations, spool: Spool, limits: ImageLimits, calibrate: Calibrate = calibrate
+    ) -> None:
+        self._calibrations = calibrations
+        self._spool = spool
+        self._limits = limits
+        self._calibrate = calibrate
+        self._is_ready = False
+        self._wake = threading.Event()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="calibration", daemon=True)
+
+    def start(self) -> None:
+        """Begin with what an earlier process left."""
+        self._thread.start()
+
+    def wake(self) -> None:
+        """Something was queued or cancelled: look at once."""
+        self._wake.set()
+
+    def close(self) -> None:
+        """Stop; the calibration at work is queued again."""
+        self._stop.set()
+        self._wake.set()
+        self._thread.join(CLOSE_S)
+        self._spool.release()
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            try:
+                is_done = not self._step()
+            except CamindError as exc:
+                log.warning("calibrations_wait", detail=exc.detail)
+                is_done = True
+            except Exception:
+                log.exception("calibrations_wait")
+                is_done = True
+            if is_done:
+                self._wake.wait(LOOK_S)
+                self._wake.clear()
+
+    def _step(self) -> bool:
+        """Run the next calibration; False where there is none, or another process works this spool off."""
+        if not self._spool.acquire():
+            return False
+        if not self._is_ready:
+            self._recover()
+            self._is_ready = True
+        for calibration_id in self._calibrations.ended(self._spool.ids()):
+            self._spool.remove(calibration_id)
+        record = self._calibrations.take(self._spool.id)
+        if record is None:
+            return False
+        if self._end_of(record):
+            self._spool.remove(record.id)
+        return True
+
+    def _recover(self) -> None:
+        self._calibrations.recover(self._spool.id)
+        ids = self._spool.ids()
+        for calibration_id in set(ids) - self._calibrations.live(ids):
+            self._spool.remove(calibration_id)
+
+    def _end_of(self, record: CalibrationRecord) -> bool:
+        """Bring a calibration to its end; False where it is left for the next start."""
+        with structlog.contextvars.bound_contextvars(calibration=record.id):
+            try:
+                ending = self._worked(record)
+            except Cancelled:
+                if self._stop.is_set():
+                    return not self._calibrations.put_back(record.id)
+                return True
+            except Exception:
+                log.exception("calibration_failed")
+                ending = Ending(
+                    "failed", problem="Something went wrong here; the log has it under the calibration's id."
+                )
+            return self._insist(lambda: self._calibrations.finish(record.id, ending))
+
+    def _worked(self, record: CalibrationRecord) -> Ending:
+        paths = self._spool.paths(record.id, len(record.draft.pictures))
+        if not all(path.is_file() for path in paths):
+            return Ending("failed", problem="Its photographs are gone: send them again.")
+        if record.attempts > MOST_ATTEMPTS:
+            return Ending("failed", problem=f"The service stopped {MOST_ATTEMPTS} times while it worked on this.")
+        settings = SETTINGS.validate_python(record.draft.settings)
+        pictures = [
+            Picture(stored.name, ROLE.validate_python(stored.role), self._loader(path))
+            for stored, path in zip(record.draft.pictures, paths, strict=True)
+        ]
+        progress = _Progress(self._calibrations, record, self._stop)
+        task = Task(settings.pattern, settings.focus_distance_m, settings.method)
+        report = self._calibrate(task, pictures, tell=progress.tell, check=progress.check)
+        return _ending(report, is_registered=settings.register)
+
+    def _loader(self, path: Path) -> Callable[[], NDArray[np.uint8]]:
+        return lambda: read_stored_frame(path.read_bytes(), self._limits)
+
+    def _insist(self, write: Callable[[], object]) -> bool:
+        """Write until the database takes it; False where the service stops before."""
+        while True:
+            try:
+                write()
+            except CamindError as exc:
+                log.warning("calibration_waits_for_the_database", detail=exc.detail)
+            else:
+                return True
+            if self._stop.wait(RETRY_S):
+                return False
+
+
+class _Progress:
+    """A calibration's line to the database: at most a write and a look a second."""
+
+    def __init__(self, calibrations: Calibrations, record: CalibrationRecord, stop: threading.Event) -> None:
+        self._calibrations = calibrations
+        self._id = record.id
+        self._stop = stop
+        self._is_wanted = True
+        self._written_s = -WRITE_S
+        self._looked_s = -WRITE_S
+
+    def tell(self, progress: float, pictures: tuple[PictureReport, ...]) -> None:
+        """Note how far it is, unless that was done just now."""
+        now_s = time.monotonic()
+        if now_s - self._written_s < WRITE_S:
+            return
+        self._written_s = self._looked_s = now_s
+        # a database that is busy is no reason to stop
+        with suppress(CamindError):
+            self._is_wanted = self._calibrations.tell(self._id, progress, _as_json(REPORTS, pictures))
+
+    def check(self) -> None:
+        """Raise ``Cancelled`` where the service stops, or somebody cancelled the calibration, here or elsewhere."""
+        now_s = time.monotonic()
+        if self._is_wanted and now_s - self._looked_s >= WRITE_S / 2:
+            self._looked_s = now_s
+            with suppress(CamindError):
+                self._is_wanted = self._calibrations.is_running(self._id)
+        if self._stop.is_set() or not self._is_wanted:
+            raise Cancelled
+
+
+def _ending(report: Report, *, is_registered: bool) -> Ending:
+    images, result = _as_json(REPORTS, report.pictures), report.result
+    if result is None:
+        return Ending("failed", images, problem=report.problem or "The photographs do not give a calibration.")
+    return Ending("succeeded", images, _as_json(RESULT, result), camera=_camera(result) if is_registered else None)
+
+
+def _as_json(form: TypeAdapter[T], value: T) -> JsonValue:
+    """What will be stored; ``ValueError`` for what would not come back, such as a NaN where a number must be."""
+    text = form.dump_json(value)
+    form.validate_json(text)
+    stored: JsonValue = json.loads(text)
+    return stored
+
+
+def _camera(result: Result) -> Camera:
+    return Camera(
+        image_width_px=result.image_width_px,
+        image_height_px=result.image_height_px,
+        focus_distance_m=result.focus_distance_m.value,
+        k_cam_px=result.k_cam_px.value,
+        gamma_px=result.gamma_px.value,
+        intrinsics=result.intrinsics,
+    )

@@ -1,0 +1,312 @@
+"""Calibrations in the database: a queue, what each has come to, and the only doors from one state to the next.
+
+``queued -> running -> succeeded | failed | cancelled``; running goes back to queued where the service stops, and what
+has ended never changes again. Each belongs to the spool, the folder of photographs, of one data folder.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from datetime import UTC, datetime, timedelta
+from typing import Literal
+
+from pydantic import JsonValue
+from sqlalchemy import Engine, func, update
+from sqlalchemy.exc import IntegrityError
+from sqlmodel import Session, col, select
+
+from service.errors import NotFound
+from service.optics.camera import Camera
+from service.storage.cameras import store_calibrated
+from service.storage.engine import reading, writing
+from service.storage.tables import CalibrationRow
+
+State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
+EndState = Literal["succeeded", "failed", "cancelled"]
+STATES: tuple[State, ...] = ("queued", "running", "succeeded", "failed", "cancelled")
+LIVE: tuple[State, ...] = ("queued", "running")
+
+ID_PATTERN = r"^[0-9a-f]{32}$"
+ABANDONED_AFTER = timedelta(days=1)
+
+
+@dataclass(frozen=True, slots=True)
+class StoredPicture:
+    """A photograph in the spool: what the user calls it, and whether it is of the grid in focus."""
+
+    name: str
+    role: str
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationDraft:
+    """A calibration to be: the camera it is for, its settings as sent, and its photographs in their order."""
+
+    id: str
+    spool: str
+    camera: str
+    settings: JsonValue
+    pictures: tuple[StoredPicture, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationRecord:
+    """A stored calibration; ``version`` grows with every change. Times are UTC."""
+
+    draft: CalibrationDraft
+    state: State
+    progress: float
+    images: JsonValue
+    result: JsonValue
+    problem: str | None
+    camera_revision: int | None
+    attempts: int
+    version: int
+    created_at: datetime
+    updated_at: datetime
+
+    @property
+    def id(self) -> str:
+        return self.draft.id
+
+    @property
+    def has_ended(self) -> bool:
+        return self.state not in LIVE
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationSummary:
+    """What a list shows of a calibration: all but what can be long."""
+
+    id: str
+    camera: str
+    state: State
+    progress: float
+    problem: str | None
+    camera_revision: int | None
+    created_at: datetime
+    updated_at: datetime
+
+
+@dataclass(frozen=True, slots=True)
+class Ending:
+    """What a calibration ends with; ``camera`` is stored under the calibration's camera name, if there is one."""
+
+    state: EndState
+    images: JsonValue = None
+    result: JsonValue = None
+    problem: str | None = None
+    camera: Camera | None = None
+
+
+class Calibrations:
+    """The calibrations of one database; safe to share between threads."""
+
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+
+    def add(self, draft: CalibrationDraft) -> CalibrationRecord:
+        """Queue a calibration."""
+        now = datetime.now(UTC)
+        row = CalibrationRow(
+            id=draft.id,
+            spool=draft.spool,
+            camera=draft.camera,
+            state="queued",
+            attempts=0,
+            version=1,
+            progress=0.0,
+            created_at=now,
+            updated_at=now,
+            settings=draft.settings,
+            pictures=[{"name": picture.name, "role": picture.role} for picture in draft.pictures],
+            images=[],
+        )
+        with writing(self._engine) as session:
+            session.add(row)
+            session.flush()
+            return _to_record(row)
+
+    def get(self, calibration_id: str) -> CalibrationRecord:
+        """The calibration as it is now. Raises ``NotFound``."""
+        with reading(self._engine) as session:
+            return _to_record(_require_row(session, calibration_id))
+
+    def version(self, calibration_id: str) -> int:
+        """A number that grows with every change, far cheaper to read than the whole; 0 for one that is not there."""
+        with reading(self._engine) as session:
+            query = select(CalibrationRow.version).where(col(CalibrationRow.id) == calibration_id)
+            return session.exec(query).first() or 0
+
+    def page(self, limit: int, after: str | None = None) -> tuple[list[CalibrationSummary], bool]:
+        """Up to ``limit`` calibrations, the newest first, from the one behind ``after``; and whether there are more."""
+        columns = [getattr(CalibrationRow, field.name) for field in fields(CalibrationSummary)]
+        query = select(*columns).order_by(col(CalibrationRow.number).desc()).limit(limit + 1)
+        if after is not None:
+            mark = select(CalibrationRow.number).where(col(CalibrationRow.id) == after).scalar_subquery()
+            query = query.where(col(CalibrationRow.number) < mark)
+        with reading(self._engine) as session:
+            summaries = [CalibrationSummary(*row) for row in session.exec(query)]
+        return summaries[:limit], len(summaries) > limit
+
+    def waiting(self, spool: str) -> int:
+        """How many of a spool's calibrations are queued."""
+        query = select(func.count()).where(col(CalibrationRow.spool) == spool, col(CalibrationRow.state) == "queued")
+        with reading(self._engine) as session:
+            return session.exec(query).one()
+
+    def live(self, ids: Sequence[str]) -> set[str]:
+        """Those of the ids that are queued or running."""
+        query = select(CalibrationRow.id).where(col(CalibrationRow.id).in_(ids), col(CalibrationRow.state).in_(LIVE))
+        with reading(self._engine) as session:
+            return set(session.exec(query))
+
+    def ended(self, ids: Sequence[str]) -> set[str]:
+        """Those of the ids that have ended; an id that is not stored is not among them."""
+        query = select(CalibrationRow.id).where(col(CalibrationRow.id).in_(ids), col(CalibrationRow.state).not_in(LIVE))
+        with reading(self._engine) as session:
+            return set(session.exec(query))
+
+    def take(self, spool: str) -> CalibrationRecord | None:
+        """The spool's next in line, now running; None where nothing waits, which costs no lock."""
+        if not self.waiting(spool):
+            return None
+        query = (
+            select(CalibrationRow)
+            .where(col(CalibrationRow.spool) == spool, col(CalibrationRow.state) == "queued")
+            .order_by(col(CalibrationRow.number))
+            .limit(1)
+            .with_for_update()
+        )
+        with writing(self._engine) as session:
+            row = session.exec(query).first()
+            if row is None:
+                return None
+            row.state, row.attempts = "running", row.attempts + 1
+            return _changed(session, row)
+
+    def tell(self, calibration_id: str, progress: float, images: JsonValue) -> bool:
+        """Note how far a running calibration is; whether it still runs."""
+        with writing(self._engine) as session:
+            row = _require_row(session, calibration_id, lock=True)
+            if row.state != "running":
+                return False
+            row.progress, row.images = min(max(progress, 0.0), 1.0), images
+            _changed(session, row)
+            return True
+
+    def is_running(self, calibration_id: str) -> bool:
+        """Whether it still runs: it does not once somebody cancelled it."""
+        with reading(self._engine) as session:
+            query = select(CalibrationRow.state).where(col(CalibrationRow.id) == calibration_id)
+            return session.exec(query).first() == "running"
+
+    def put_back(self, calibration_id: str) -> bool:
+        """Queue a running calibration again, as if it had not been tried; whether it was running."""
+        with writing(self._engine) as session:
+            row = _require_row(session, calibration_id, lock=True)
+            if row.state != "running":
+                return False
+            row.state, row.attempts = "queued", row.attempts - 1
+            row.progress, row.images = 0.0, []
+            _changed(session, row)
+            return True
+
+    def finish(self, calibration_id: str, ending: Ending) -> bool:
+        """End a running calibration and store its camera, both or neither; whether it was still running."""
+        try:
+            return self._finish(calibration_id, ending)
+        except IntegrityError:
+            # another process made the camera's name between the look and the insert: now it is there to revise
+            return self._finish(calibration_id, ending)
+
+    def cancel(self, calibration_id: str) -> State:
+        """Cancel what has not ended; the state before. Raises ``NotFound``."""
+        with writing(self._engine) as session:
+            row = _require_row(session, calibration_id, lock=True)
+            before = _to_state(row.state)
+            if before in LIVE:
+                row.state = "cancelled"
+                _changed(session, row)
+            return before
+
+    def recover(self, spool: str) -> None:
+        """What the spool's last run left running is queued again; what other spools left behind long ago fails."""
+        now = datetime.now(UTC)
+        again = (
+            update(CalibrationRow)
+            .where(col(CalibrationRow.spool) == spool, col(CalibrationRow.state) == "running")
+            .values(state="queued", progress=0.0, images=[], version=CalibrationRow.version + 1, updated_at=now)
+        )
+        given_up = (
+            update(CalibrationRow)
+            .where(
+                col(CalibrationRow.spool) != spool,
+                col(CalibrationRow.state).in_(LIVE),
+                col(CalibrationRow.updated_at) < now - ABANDONED_AFTER,
+            )
+            .values(
+                state="failed",
+                problem="The service that held its photographs did not come back: send them again.",
+                version=CalibrationRow.version + 1,
+                updated_at=now,
+            )
+        )
+        with writing(self._engine) as session:
+            session.connection().execute(again)
+            session.connection().execute(given_up)
+
+    def _finish(self, calibration_id: str, ending: Ending) -> bool:
+        with writing(self._engine) as session:
+            row = _require_row(session, calibration_id, lock=True)
+            if row.state != "running":
+                return False
+            if ending.camera is not None:
+                row.camera_revision = store_calibrated(session, row.camera, ending.camera).revision
+            row.state, row.result, row.problem = ending.state, ending.result, ending.problem
+            row.images = row.images if ending.images is None else ending.images
+            row.progress = 1.0 if ending.state == "succeeded" else row.progress
+            _changed(session, row)
+            return True
+
+
+def _require_row(session: Session, calibration_id: str, *, lock: bool = False) -> CalibrationRow:
+    row = None
+    if re.fullmatch(ID_PATTERN, calibration_id):
+        query = select(CalibrationRow).where(col(CalibrationRow.id) == calibration_id)
+        row = session.exec(query.with_for_update() if lock else query).first()
+    if row is None:
+        raise NotFound("There is no such calibration: GET /calibrations lists them.")
+    return row
+
+
+def _changed(session: Session, row: CalibrationRow) -> CalibrationRecord:
+    row.version += 1
+    row.updated_at = datetime.now(UTC)
+    session.add(row)
+    session.flush()
+    return _to_record(row)
+
+
+def _to_record(row: CalibrationRow) -> CalibrationRecord:
+    pictures = tuple(StoredPicture(picture["name"], picture["role"]) for picture in row.pictures)
+    return CalibrationRecord(
+        draft=CalibrationDraft(row.id, row.spool, row.camera, row.settings, pictures),
+        state=_to_state(row.state),
+        progress=row.progress,
+        images=row.images,
+        result=row.result,
+        problem=row.problem,
+        camera_revision=row.camera_revision,
+        attempts=row.attempts,
+        version=row.version,
+        created_at=row.created_at,
+        updated_at=row.updated_at,
+    )
+
+
+def _to_state(value: str) -> State:
+    for state in STATES:
+        if state == value:
+            return state
+    raise ValueError(f"a stored calibration has the unknown state {value!r}")

@@ -1,0 +1,30 @@
+"""``camind serve`` with a stand-in for the calibration, held unless the data folder has a file ``go``."""
+
+import sys
+from pathlib import Path
+
+from service import logs, server
+from service.app import create_app
+from service.config import load_settings
+from tests.fake_calibration import FakeCalibration
+
+GO = "go"
+
+
+def write_command(folder: Path) -> Path:
+    """A program that starts it."""
+    program = folder / "held-camind"
+    program.write_text(f"#!{sys.executable}\nfrom tests.held_server import main\nmain()\n")
+    program.chmod(0o755)
+    return program
+
+
+def main() -> None:
+    """Serve with the model folder that follows ``--model``, on a port the system chooses."""
+    settings = load_settings(port=0, model_dir=Path(sys.argv[sys.argv.index("--model") + 1]))
+    logs.configure(settings.log_level, settings.log_format)
+    listener = server.bind(settings.host, settings.port)
+    sys.stderr.write(f"camind on http://{settings.host}:{listener.getsockname()[1]}\n")
+    sys.stderr.flush()
+    fake = FakeCalibration(is_held=not (settings.data_dir / GO).exists())
+    server.serve(create_app(settings, fake), settings, listener)

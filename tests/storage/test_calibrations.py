@@ -1,0 +1,250 @@
+"""The queue of calibrations keeps its order and its promises, on SQLite and on PostgreSQL, under a race too."""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from typing import Any
+from uuid import uuid4
+
+import pytest
+from sqlalchemy import Engine, update
+from sqlalchemy.exc import StatementError
+
+from service.errors import NotFound
+from service.optics.camera import Camera, Intrinsics
+from service.storage.calibrations import (
+    CalibrationDraft,
+    CalibrationRecord,
+    Calibrations,
+    Ending,
+    EndState,
+    StoredPicture,
+)
+from service.storage.cameras import CameraDraft, Cameras
+from service.storage.engine import writing
+from service.storage.tables import CalibrationRow
+from tests.fake_calibration import SETTINGS
+
+SPOOL, OTHER_SPOOL = "a" * 32, "b" * 32
+CAMERA = Camera(64, 48, 1.5, 6.5, 0.75, intrinsics=Intrinsics(80.0, 81.0, 31.5, 23.5, (0.1, 0.2, 0.0, 0.0, 0.3)))
+PICTURES = (StoredPicture("Größe 👍.jpg", "focused"), StoredPicture("near.jpg", "defocused"))
+SUCCESS = Ending("succeeded", [{"name": "near.jpg"}], {"k_cam_px": {"value": 6.5}})
+
+
+@pytest.fixture
+def calibrations(engine: Engine) -> Calibrations:
+    return Calibrations(engine)
+
+
+def draft(spool: str = SPOOL, camera: str = "bench") -> CalibrationDraft:
+    return CalibrationDraft(uuid4().hex, spool, camera, dict(SETTINGS), PICTURES)
+
+
+def running(calibrations: Calibrations, camera: str = "bench") -> str:
+    calibration_id = calibrations.add(draft(camera=camera)).id
+    taken = calibrations.take(SPOOL)
+    assert taken is not None
+    assert taken.id == calibration_id
+    return calibration_id
+
+
+def ended(calibrations: Calibrations, state: EndState) -> str:
+    calibration_id = running(calibrations)
+    if state == "cancelled":
+        calibrations.cancel(calibration_id)
+    else:
+        calibrations.finish(calibration_id, Ending(state))
+    return calibration_id
+
+
+def test_nothing_is_lost(calibrations: Calibrations) -> None:
+    before = datetime.now(UTC)
+    wanted = draft()
+    added = calibrations.add(wanted)
+    read = calibrations.get(wanted.id)
+    assert read == added
+    assert read.draft == wanted
+    assert (read.state, read.progress, read.images, read.result, read.problem) == ("queued", 0.0, [], None, None)
+    assert before <= read.created_at == read.updated_at <= datetime.now(UTC)
+
+
+def test_the_first_to_come_is_the_first_to_run(calibrations: Calibrations) -> None:
+    ids = [calibrations.add(draft()).id for _ in range(3)]
+    calibrations.add(draft(OTHER_SPOOL))
+    assert calibrations.waiting(SPOOL) == 3
+    taken = [calibrations.take(SPOOL) for _ in range(4)]
+    assert [record and record.id for record in taken] == [*ids, None]
+    assert calibrations.waiting(SPOOL) == 0
+    assert calibrations.waiting(OTHER_SPOOL) == 1
+
+
+def test_one_of_many_takes_what_waits(calibrations: Calibrations) -> None:
+    calibrations.add(draft())
+    with ThreadPoolExecutor(4) as pool:
+        taken = list(pool.map(lambda _: calibrations.take(SPOOL), range(4)))
+    assert sum(record is not None for record in taken) == 1
+
+
+def test_every_change_has_a_version(calibrations: Calibrations) -> None:
+    calibration_id = calibrations.add(draft()).id
+    versions = [calibrations.version(calibration_id)]
+    for change in (
+        lambda: calibrations.take(SPOOL),
+        lambda: calibrations.tell(calibration_id, 0.5, [{"name": "near.jpg"}]),
+        lambda: calibrations.finish(calibration_id, SUCCESS),
+    ):
+        change()
+        versions.append(calibrations.version(calibration_id))
+    assert versions == [1, 2, 3, 4]
+    read = calibrations.get(calibration_id)
+    assert (read.version, read.state, read.progress) == (4, "succeeded", 1.0)
+    assert (read.images, read.result) == (SUCCESS.images, SUCCESS.result)
+    assert read.updated_at > read.created_at
+
+
+@pytest.mark.parametrize(("told", "kept"), [(-1.0, 0.0), (0.25, 0.25), (7.0, 1.0)])
+def test_progress_stays_within_bounds(calibrations: Calibrations, told: float, kept: float) -> None:
+    calibration_id = running(calibrations)
+    calibrations.tell(calibration_id, told, [])
+    assert calibrations.get(calibration_id).progress == kept
+
+
+@pytest.mark.parametrize("state", ["succeeded", "failed", "cancelled"])
+def test_what_has_ended_never_changes_again(calibrations: Calibrations, cameras: Cameras, state: EndState) -> None:
+    calibration_id = ended(calibrations, state)
+    before = calibrations.get(calibration_id)
+    assert before.state == state
+    assert before.has_ended
+    assert not calibrations.tell(calibration_id, 0.9, [])
+    assert not calibrations.put_back(calibration_id)
+    assert not calibrations.is_running(calibration_id)
+    assert not calibrations.finish(calibration_id, replace(SUCCESS, camera=CAMERA))
+    assert calibrations.cancel(calibration_id) == state
+    calibrations.recover(SPOOL)
+    assert calibrations.get(calibration_id) == before
+    with pytest.raises(NotFound):
+        cameras.get("bench")
+
+
+def test_what_waits_can_be_cancelled_and_is_not_taken(calibrations: Calibrations) -> None:
+    calibration_id = calibrations.add(draft()).id
+    assert calibrations.cancel(calibration_id) == "queued"
+    assert calibrations.take(SPOOL) is None
+    assert calibrations.get(calibration_id).state == "cancelled"
+
+
+def test_what_is_put_back_was_not_tried(calibrations: Calibrations) -> None:
+    calibration_id = running(calibrations)
+    calibrations.tell(calibration_id, 0.5, [{"name": "near.jpg"}])
+    assert calibrations.put_back(calibration_id)
+    read = calibrations.get(calibration_id)
+    assert (read.state, read.attempts, read.progress, read.images) == ("queued", 0, 0.0, [])
+
+
+def test_what_a_dead_process_left_is_tried_again(calibrations: Calibrations) -> None:
+    calibration_id = running(calibrations)
+    calibrations.recover(OTHER_SPOOL)
+    assert calibrations.get(calibration_id).state == "running"
+    calibrations.recover(SPOOL)
+    assert calibrations.get(calibration_id).state == "queued"
+    again = calibrations.take(SPOOL)
+    assert again is not None
+    assert (again.id, again.attempts) == (calibration_id, 2)
+
+
+def test_what_a_lost_service_held_fails_after_a_day(calibrations: Calibrations, engine: Engine) -> None:
+    ids = [calibrations.add(draft()).id, running_elsewhere(calibrations).id]
+    calibrations.recover("c" * 32)
+    assert [calibrations.get(each).state for each in ids] == ["queued", "running"]
+    with writing(engine) as session:
+        yesterday = datetime.now(UTC) - timedelta(days=1, minutes=1)
+        session.connection().execute(update(CalibrationRow).values(updated_at=yesterday))
+    calibrations.recover("c" * 32)
+    for each in ids:
+        read = calibrations.get(each)
+        assert read.state == "failed"
+        assert "did not come back" in (read.problem or "")
+
+
+def running_elsewhere(calibrations: Calibrations) -> CalibrationRecord:
+    calibrations.add(draft(OTHER_SPOOL))
+    record = calibrations.take(OTHER_SPOOL)
+    assert record is not None
+    return record
+
+
+def test_a_camera_is_made_with_the_end(calibrations: Calibrations, cameras: Cameras) -> None:
+    calibration_id = running(calibrations, "new")
+    assert calibrations.finish(calibration_id, replace(SUCCESS, camera=CAMERA))
+    camera = cameras.get("new")
+    assert camera.draft == CameraDraft("new", CAMERA, "calibration")
+    assert camera.revision == calibrations.get(calibration_id).camera_revision == 1
+
+
+def test_a_camera_gets_a_revision_and_keeps_its_description(calibrations: Calibrations, cameras: Cameras) -> None:
+    cameras.add(CameraDraft("bench", Camera(640, 480, 2.0, 3.0), "given", description="on the shelf"))
+    first = running(calibrations)
+    calibrations.finish(first, replace(SUCCESS, camera=CAMERA))
+    assert cameras.get("bench").draft == CameraDraft("bench", CAMERA, "calibration", description="on the shelf")
+    cameras.delete("bench")
+    second = running(calibrations)
+    calibrations.finish(second, replace(SUCCESS, camera=CAMERA))
+    assert cameras.get("bench").draft.description is None
+    assert [calibrations.get(each).camera_revision for each in (first, second)] == [2, 3]
+
+
+def test_an_end_that_cannot_be_stored_leaves_no_camera(calibrations: Calibrations, cameras: Cameras) -> None:
+    calibration_id = running(calibrations, "new")
+    no_json: Any = object()
+    with pytest.raises((TypeError, StatementError)):
+        calibrations.finish(calibration_id, Ending("succeeded", result=no_json, camera=CAMERA))
+    assert calibrations.get(calibration_id).state == "running"
+    assert cameras.page(10) == ([], False)
+
+
+def test_ends_at_once_make_one_camera(calibrations: Calibrations, cameras: Cameras) -> None:
+    ids = [running(calibrations, "new") for _ in range(4)]
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(lambda each: calibrations.finish(each, replace(SUCCESS, camera=CAMERA)), ids))
+    assert sorted(calibrations.get(each).camera_revision or 0 for each in ids) == [1, 2, 3, 4]
+    assert cameras.get("new").revision == 4
+
+
+def test_one_of_cancel_and_finish_wins(calibrations: Calibrations) -> None:
+    for _ in range(5):
+        calibration_id = running(calibrations)
+        with ThreadPoolExecutor(2) as pool:
+            finished = pool.submit(calibrations.finish, calibration_id, SUCCESS)
+            before = pool.submit(calibrations.cancel, calibration_id)
+            is_finished = finished.result()
+            assert before.result() == ("succeeded" if is_finished else "running")
+        assert calibrations.get(calibration_id).state == ("succeeded" if is_finished else "cancelled")
+
+
+def test_pages_follow_one_another_from_the_newest(calibrations: Calibrations) -> None:
+    ids = [calibrations.add(draft(camera=f"camera-{number}")).id for number in range(5)]
+    first, has_more = calibrations.page(2)
+    assert ([item.id for item in first], has_more) == ([ids[4], ids[3]], True)
+    assert (first[0].camera, first[0].state) == ("camera-4", "queued")
+    middle, _ = calibrations.page(2, after=first[-1].id)
+    last, has_more = calibrations.page(2, after=middle[-1].id)
+    assert ([item.id for item in last], has_more) == ([ids[0]], False)
+    assert calibrations.page(2, after=uuid4().hex) == ([], False)
+
+
+def test_ids_are_sorted_by_what_became_of_them(calibrations: Calibrations) -> None:
+    live, over, unknown = calibrations.add(draft()).id, "", uuid4().hex
+    calibrations.cancel(live)
+    over, live = live, calibrations.add(draft()).id
+    assert calibrations.live([live, over, unknown]) == {live}
+    assert calibrations.ended([live, over, unknown]) == {over}
+    assert calibrations.live([]) == set()
+
+
+@pytest.mark.parametrize("name", ["nobody", "", "a\x00b", "A" * 32, "x" * 65, "f" * 32])
+def test_an_unknown_id_is_not_found(calibrations: Calibrations, name: str) -> None:
+    actions: list[Callable[[], object]] = [lambda: calibrations.get(name), lambda: calibrations.cancel(name)]
+    for action in actions:
+        with pytest.raises(NotFound):
+            action()

@@ -1,0 +1,54 @@
+"""The spool keeps photographs under names of its own, and is worked off by one process at a time."""
+
+from pathlib import Path
+from uuid import uuid4
+
+import pytest
+
+from service.storage.spool import Spool, picture_file
+
+
+@pytest.fixture
+def spool(tmp_path: Path) -> Spool:
+    return Spool(tmp_path / "data" / "calibrations")
+
+
+def test_a_spool_has_one_id_for_ever(spool: Spool, tmp_path: Path) -> None:
+    assert Spool(tmp_path / "data" / "calibrations").id == spool.id
+    assert Spool(tmp_path / "other").id != spool.id
+    assert len(spool.id) == 32
+
+
+def test_what_was_received_stays_until_it_is_removed(spool: Spool) -> None:
+    calibration_id = uuid4().hex
+    with spool.receiving(calibration_id) as folder:
+        assert spool.incoming == 1
+        (folder / picture_file(0)).write_bytes(b"picture")
+        spool.seal(calibration_id)
+    assert spool.incoming == 0
+    assert spool.ids() == [calibration_id]
+    assert [path.read_bytes() for path in spool.paths(calibration_id, 1)] == [b"picture"]
+    spool.remove(calibration_id)
+    spool.remove(calibration_id)
+    assert spool.ids() == []
+
+
+def test_what_was_not_received_whole_is_gone(spool: Spool) -> None:
+    def receive() -> None:
+        with spool.receiving(uuid4().hex) as folder:
+            (folder / picture_file(0)).write_bytes(b"pic")
+            raise ConnectionError
+
+    with pytest.raises(ConnectionError):
+        receive()
+    assert (spool.ids(), spool.incoming) == ([], 0)
+
+
+def test_one_at_a_time_works_it_off(spool: Spool, tmp_path: Path) -> None:
+    other = Spool(tmp_path / "data" / "calibrations")
+    assert spool.acquire()
+    assert spool.acquire()
+    assert not other.acquire()
+    spool.release()
+    assert other.acquire()
+    other.release()
