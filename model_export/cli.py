@@ -1,4 +1,4 @@
-"""What training adds to the command ``camind``: train, export, verify, evaluate, blender."""
+"""What training adds to the command ``camind``: train, export, verify, evaluate, bench, blender."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,6 +15,8 @@ if TYPE_CHECKING:  # importing torch takes seconds; a command that needs it does
     from model_export.verify import Difference
 
 commands = typer.Typer(help="Train, export and score models.")
+bench = typer.Typer(help="Measure accuracy and speed where the truth is known.", no_args_is_help=True)
+commands.add_typer(bench, name="bench")
 
 Kind = Annotated[str, typer.Option(help="compact (ours) or paper")]
 Model = Annotated[Path, typer.Option(help="model folder", file_okay=False)]
@@ -133,6 +135,39 @@ def evaluate(
         from model_export.card import record_scores
 
         record_scores(model, report.scores(), reports.markdown(report), "camind evaluate --data DATA")
+
+
+@bench.command()
+def calibration(
+    cameras: Annotated[int, typer.Option(min=0, help="random cameras")] = 100,
+    pairs: Annotated[
+        int, typer.Option(min=0, help="pairs for each k_cam of the paper; 0: none")
+    ] = 20,
+    workers: Annotated[int, typer.Option(min=1, max=64, help="processes")] = 2,
+) -> None:
+    """Calibrate simulated cameras: errors, intervals, and the paper's Fig. 4 by both methods."""
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    with _training_parts():
+        from model_export import bench_calibration as trials
+
+    stdout = Console()
+    with (
+        progress_bar(Console(stderr=True)) as progress,
+        ProcessPoolExecutor(workers, get_context("forkserver"), initializer=trials.one_thread) as pool,
+    ):
+        found = list(progress.track(pool.map(trials.random_camera, range(cameras)), cameras, description="cameras"))
+        if found:
+            stdout.print(trials.error_table(found))
+        if pairs:
+            numbers = trials.PAPER_NUMBERS
+            results = pool.map(trials.paper_pairs, numbers, [pairs] * len(numbers))
+            table = Table(*trials.PAPER_HEAD, title=f"{pairs} pairs at half the focus distance")
+            for number, both in zip(numbers, progress.track(results, len(numbers), description="pairs"), strict=True):
+                for method, trial in both:
+                    table.add_row(*trials.paper_row(number, method, trial))
+            stdout.print(table)
 
 
 @commands.command()

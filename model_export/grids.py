@@ -74,10 +74,13 @@ def draw_pose(
 ) -> GridPose:
     """The sheet with its middle about ``depth_m`` away, tilted by up to ``tilt_deg``, turned, and wholly in view."""
     middle = np.append(grid.points_mm().mean(0), 0.0) / 1e3
+    is_tall = grid.size_mm[1] > grid.size_mm[0]
+    lengthwise = math.pi / 2 if is_tall == (camera.width_px > camera.height_px) else 0.0
     for attempt in range(200):
-        tilt, axis, roll = math.radians(rng.uniform(0.2, 1) * tilt_deg), rng.uniform(0, 2 * math.pi), rng.uniform(-1, 1)
+        tilt, axis = math.radians(rng.uniform(0.2, 1) * tilt_deg), rng.uniform(0, 2 * math.pi)
+        roll = lengthwise + rng.uniform(-0.4, 0.4)
         lean = cv2.Rodrigues(np.array([math.cos(axis), math.sin(axis), 0]) * tilt)[0]
-        turn = np.asarray(lean @ cv2.Rodrigues(np.array([0, 0, roll * 0.5]))[0], np.float64)
+        turn = np.asarray(lean @ cv2.Rodrigues(np.array([0, 0, roll]))[0], np.float64)
         room = 0.3 * (1 - attempt / 200)
         aside = rng.uniform(-room, room, 2) * depth_m * camera.width_px / camera.intrinsics.fx_px
         shift = np.array([*aside, depth_m]) - turn @ middle

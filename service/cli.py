@@ -108,6 +108,48 @@ def target(
     typer.echo(out)
 
 
+@app.command()
+def calibrate(
+    folder: Annotated[
+        Path, typer.Argument(help="Photographs, or the folders focused/ and defocused/ of them", exists=True)
+    ],
+    kind: Literal["asymmetric_circles", "symmetric_circles"] = "asymmetric_circles",
+    rows: Annotated[int, typer.Option(min=2, max=40)] = 11,
+    columns: Annotated[int, typer.Option(min=2, max=40)] = 4,
+    spacing_mm: Annotated[float, typer.Option(help="The spacing s of the grid, as measured on the sheet")] = 20.0,
+    diameter_mm: Annotated[float, typer.Option(help="Of each circle")] = 12.0,
+    focus_distance_m: Annotated[float | None, typer.Option(help="Where the lens is focused. [default: found]")] = None,
+    method: Literal["edge", "paper"] = "edge",
+    out: Annotated[Path, typer.Option(help="Report to write; its plot goes beside it", dir_okay=False)] = Path(
+        "calibration.json"
+    ),
+    register: Annotated[str | None, typer.Option(help="Camera to store, or to give a new revision")] = None,
+) -> None:
+    """Photographs of the sheet to a camera's k_cam, gamma, focus distance and intrinsics."""
+    from service.calibration.calibrate import Task
+    from service.calibration.target import CircleGrid
+    from service.calibration_folder import calibrate_folder, summary
+    from service.inference.images import ImageLimits
+
+    settings = _settings()
+    limits = ImageLimits(settings.max_image_bytes, settings.max_image_pixels)
+    with _plain_failures():
+        try:
+            grid = CircleGrid(kind, rows, columns, spacing_mm, diameter_mm)
+            report = calibrate_folder(folder, Task(grid, focus_distance_m, method), limits, out)
+        except ValueError as exc:
+            raise _failure(str(exc), WRONG_USE) from exc
+    typer.echo("\n".join(summary(report)))
+    if report.result is None:
+        raise typer.Exit(1)
+    if register is not None:
+        from service.storage.cameras import Cameras
+
+        with _plain_failures():
+            record = Cameras(_ready_engine()).store_calibrated(register, report.result.to_camera())
+        typer.echo(f"stored as {record.name}, revision {record.revision}")
+
+
 @app.command(name="version")
 def print_version() -> None:
     """Print the version."""

@@ -24,7 +24,6 @@ from service.calibration.target import CircleGrid
 from service.errors import CamindError
 from service.inference.cancellation import Cancelled
 from service.inference.images import ImageLimits, read_stored_frame
-from service.optics.camera import Camera
 from service.storage.calibrations import CalibrationRecord, Calibrations, Ending
 from service.storage.spool import Spool
 
@@ -218,7 +217,7 @@ def _ending(report: Report, *, is_registered: bool) -> Ending:
     images, result = _as_json(REPORTS, report.pictures), report.result
     if result is None:
         return Ending("failed", images, problem=report.problem or "The photographs do not give a calibration.")
-    return Ending("succeeded", images, _as_json(RESULT, result), camera=_camera(result) if is_registered else None)
+    return Ending("succeeded", images, _as_json(RESULT, result), camera=result.to_camera() if is_registered else None)
 
 
 def _as_json(form: TypeAdapter[T], value: T) -> JsonValue:
@@ -227,14 +226,3 @@ def _as_json(form: TypeAdapter[T], value: T) -> JsonValue:
     form.validate_json(text)
     stored: JsonValue = json.loads(text)
     return stored
-
-
-def _camera(result: Result) -> Camera:
-    return Camera(
-        image_width_px=result.image_width_px,
-        image_height_px=result.image_height_px,
-        focus_distance_m=result.focus_distance_m.value,
-        k_cam_px=result.k_cam_px.value,
-        gamma_px=result.gamma_px.value,
-        intrinsics=result.intrinsics,
-    )

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pydantic import JsonValue
 
 from service.calibration.calibrate import Picture, Task
-from service.calibration.fit import Interval
+from service.calibration.fit import CurvePoint, Interval
 from service.calibration.report import PictureReport, Report, Result, Sample
 from service.errors import CamindError
 from service.optics.camera import Intrinsics
@@ -18,12 +18,14 @@ RESULT = Result(
     k_cam_px=Interval(6.5, 6.25, 6.75),
     gamma_px=Interval(0.75, 0.5, 1.0),
     focus_distance_m=Interval(1.5, 1.25, 1.75),
+    point_spread="disc",
     intrinsics=Intrinsics(80.0, 81.0, 31.5, 23.5, (0.125, -0.25, 0.0, 0.0, 0.5)),
     reprojection_rms_px=0.125,
     samples=(
-        Sample(0, "near.png", 1.0, 3.25, 0.0625, 6.5, 0.5, used=True),
-        Sample(1, "near.png", 1.5, 0.75, 0.0625, None, 0.25, used=False),
+        Sample(0, "near.png", 20.0, 12.0, 1.0, 3.25, 0.0625, 6.5, used=True),
+        Sample(1, "near.png", 40.0, 12.0, 1.5, 0.75, 0.0625, None, used=False),
     ),
+    curve=(CurvePoint(1.0, 3.25, 3.0, 3.5),),
     warnings=("fewer than three pictures: the intervals are guesses",),
 )
 SETTINGS: dict[str, JsonValue] = {

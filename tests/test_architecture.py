@@ -50,7 +50,7 @@ def run_python(code: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("name", ["torch", "onnx", "onnxscript", "model_export", "matplotlib"])
+@pytest.mark.parametrize("name", ["torch", "onnx", "onnxscript", "model_export"])
 def test_the_service_imports_nothing_of_training(name: str) -> None:
     assert importers(name, SERVICE) == []
 
@@ -68,9 +68,13 @@ def test_one_module_alone_imports(name: str) -> None:
     assert len(importers(name, SERVICE)) == 1
 
 
-@pytest.mark.parametrize("name", ["numpy", "cv2", "fastapi", "pydantic", "sqlmodel"])
-def test_the_physics_imports_the_standard_library_alone(name: str) -> None:
+@pytest.mark.parametrize("name", ["cv2", "scipy", "fastapi", "pydantic", "sqlmodel"])
+def test_the_physics_imports_at_most_numpy(name: str) -> None:
     assert importers(name, OPTICS) == []
+
+
+def test_formulas_serve_every_array_library() -> None:
+    assert importers("numpy", [path for path in OPTICS if path.name != "light.py"]) == []
 
 
 def test_no_folder_is_called_after_nothing() -> None:

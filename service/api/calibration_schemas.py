@@ -7,6 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from service.api.problems import invalid_request
 from service.api.schemas import Given, Name, PinholeIntrinsics
+from service.calibration.edge import Shape
 from service.calibration.report import Method, Role
 from service.calibration.target import CircleGrid, Kind
 from service.errors import BadRequest, FieldProblem
@@ -115,12 +116,22 @@ class SampleRead(BaseModel):
 
     circle: Annotated[int, Field(description="Its number in the grid, row by row")]
     image: Annotated[str, Field(description="The photograph's name")]
-    depth_m: float
+    u_px: Annotated[float, Field(description="Where its centre is, before EXIF orientation")]
+    v_px: float
+    depth_m: Annotated[float, Field(description="Along the optical axis")]
     blur_px: float
     blur_error_px: Annotated[float, Field(description="Standard error of `blur_px`")]
     k_cam_px: Annotated[float | None, Field(description="What this circle alone says; null in the plane in focus")]
-    field: Annotated[float, Field(description="Distance from the principal point over half the image's diagonal")]
     used: Annotated[bool, Field(description="False for an outlier")]
+
+
+class CurvePointRead(BaseModel):
+    """The blur that the constants give at one distance, and where it lies with a confidence of 95 %."""
+
+    depth_m: float
+    blur_px: float
+    low_px: float
+    high_px: float
 
 
 class ResultRead(BaseModel):
@@ -131,9 +142,11 @@ class ResultRead(BaseModel):
     k_cam_px: IntervalRead
     gamma_px: IntervalRead
     focus_distance_m: Annotated[IntervalRead, Field(description="Of no width where it was given")]
+    point_spread: Annotated[Shape, Field(description="The shape of defocus that fits the circles better")]
     intrinsics: PinholeIntrinsics
     reprojection_rms_px: Annotated[float, Field(description="How well the circles' places fit the lens")]
     samples: list[SampleRead]
+    curve: Annotated[list[CurvePointRead], Field(description="The fitted blur over the distances measured")]
     warnings: list[str]
 
 

@@ -26,7 +26,6 @@ from service.api.preferences import MOST_WAIT_S, wait_of
 from service.api.problems import responses
 from service.api.schemas import Name
 from service.api.uploads import MULTIPART
-from service.calibration.plot import as_svg
 from service.errors import (
     BadRequest,
     Busy,
@@ -184,6 +183,8 @@ def plot_calibration(record: FoundDep) -> Response:
     """The measured circles and the curve through them."""
     if record.result is None:
         raise Conflict(f"This calibration is {record.state} and has no result: only one that succeeded has a plot.")
+    from service.calibration.plot import as_svg  # matplotlib is slow to import, and seldom needed
+
     return Response(as_svg(RESULT.validate_python(record.result)), media_type="image/svg+xml")
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.calibration import fit
-from service.calibration.edge import EdgeError, EdgeFit, fit_edge, slice_blur
+from service.calibration.edge import EdgeError, EdgeFit, find_spread, fit_again, fit_edge, slice_blur
 from service.calibration.grid import FoundGrid, GridError, find_grid
 from service.calibration.pose import Placement, PoseError, View, place
 from service.calibration.report import Method, PictureReport, Report, Result, Role, Sample
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 Tell = Callable[[float, tuple[PictureReport, ...]], None]
 
 TELL_EVERY_S = 1.0
-FITTING_PART = 0.1  # of the progress
+FITTING_PART = 0.2  # of the progress
 CLIPPED_LEVEL = 252
 CLIPPED_PART = 0.5
 PAPER_FROM_RADII, PAPER_TO_RADII = 1.3, 1.6
@@ -65,11 +65,14 @@ class _Measured:
     size_px: tuple[int, int] = (0, 0)
     circles: list[int] = field(default_factory=list)
     centres_px: list[tuple[float, float]] = field(default_factory=list)
-    blur_px: list[float] = field(default_factory=list)
-    error_px: list[float] = field(default_factory=list)
+    edges: list[EdgeFit] = field(default_factory=list)
+    slices_px: list[float] = field(default_factory=list)  # lambda as the paper reads it, if asked for
 
     def view(self) -> View:
         return View(np.array(self.circles, np.int64), np.array(self.centres_px, np.float64))
+
+    def blur_px(self) -> list[float]:
+        return self.slices_px or [edge.blur_px for edge in self.edges]
 
     def warn(self, words: str) -> None:
         self.report = replace(self.report, warnings=(*self.report.warnings, words))
@@ -115,9 +118,8 @@ def calibrate(
             one = _measured(task, picture, at)
             measured.append(one)
             teller.reports.append(one.report)
-        teller.at(1 - FITTING_PART)
         try:
-            result = _fitted(task, measured)
+            result = _fitted(task, measured, lambda part: teller.at(1 - FITTING_PART + FITTING_PART * part))
         except (PoseError, fit.FitError) as error:
             return Report(tuple(one.report for one in measured), None, str(error))
     return Report(tuple(one.report for one in measured), result, None)
@@ -143,7 +145,7 @@ def _measured(task: Task, picture: Picture, at: Callable[[float], None]) -> _Mea
     out.report = replace(
         out.report,
         circles=len(out.circles),
-        blur_px=float(np.median(out.blur_px)) if out.blur_px else None,
+        blur_px=float(np.median(out.blur_px())) if out.edges else None,
     )
     return out
 
@@ -160,17 +162,15 @@ def _measure_circles(
             if _is_clipped(peak, x - left, y - top, radius):
                 raise EdgeError("the paper around it is overexposed: expose so that white stays grey")
             edge = fit_edge(light, x - left, y - top, radius, like)
-            blur_px, error_px = edge.blur_px, edge.blur_error_px
             if task.method == "paper":
-                blur_px = slice_blur(light, edge.x_px, edge.y_px, edge.radius_px)
+                out.slices_px.append(slice_blur(light, edge.x_px, edge.y_px, edge.radius_px))
         except EdgeError as error:
             reasons[str(error)] += 1
             continue
         like = edge
         out.circles.append(number)
         out.centres_px.append((edge.x_px + left, edge.y_px + top))
-        out.blur_px.append(blur_px)
-        out.error_px.append(error_px)
+        out.edges.append(edge)
     for reason, count in reasons.most_common(3):
         out.warn(f"{count} of {len(grid.radii_px)} circles not measured: {reason}")
 
@@ -195,24 +195,29 @@ def _is_clipped(peak: NDArray[np.uint8], x: float, y: float, radius: float) -> b
     return levels.size > 0 and float((levels >= CLIPPED_LEVEL).mean()) > CLIPPED_PART
 
 
-def _fitted(task: Task, measured: list[_Measured]) -> Result:
+def _fitted(task: Task, measured: list[_Measured], at: Callable[[float], None]) -> Result:
     size_px, usable = _of_one_size(measured)
     placement, usable = _placed(task.grid, usable, size_px)
     for one, distance, tilt in zip(usable, placement.distance_m, placement.tilt_deg, strict=True):
         one.report = replace(one.report, distance_m=distance, tilt_deg=tilt)
     circles = _circles(usable, placement)
+    constants = _constants(task, circles, placement, resamples=0 if task.method == "edge" else fit.RESAMPLES)
+    spread = find_spread([edge for one in usable for edge in one.edges], constants.gamma_px.value)
     if task.method == "edge":
-        constants = fit.fit_constants(circles, task.focus_distance_m, depth_error=placement.focal_error)
-    elif task.focus_distance_m is None:
-        raise fit.FitError("the paper's method needs the focus distance: give focus_distance_m")
-    else:
-        constants = fit.fit_as_paper(circles, task.focus_distance_m, depth_error=placement.focal_error)
+        for number, one in enumerate(usable):
+            at(number / len(usable))
+            one.edges = [fit_again(edge, spread) for edge in one.edges]
+        circles = _circles(usable, placement)
+        constants = _constants(task, circles, placement)
+    for one in usable:
+        one.report = replace(one.report, blur_px=float(np.median(one.blur_px())))
     samples = tuple(_samples(usable, circles, constants))
     return Result(
         *size_px,
         k_cam_px=constants.k_cam_px,
         gamma_px=constants.gamma_px,
         focus_distance_m=constants.focus_distance_m,
+        point_spread=spread.shape,
         intrinsics=placement.intrinsics,
         reprojection_rms_px=placement.overall_rms_px,
         samples=samples,
@@ -224,6 +229,17 @@ def _fitted(task: Task, measured: list[_Measured]) -> Result:
             *_over_field(samples, placement, size_px),
         ),
     )
+
+
+def _constants(
+    task: Task, circles: fit.Circles, placement: Placement, *, resamples: int = fit.RESAMPLES
+) -> fit.Constants:
+    error = placement.focal_error
+    if task.method == "edge":
+        return fit.fit_constants(circles, task.focus_distance_m, depth_error=error, resamples=resamples)
+    if task.focus_distance_m is None:
+        raise fit.FitError("the paper's method needs the focus distance: give focus_distance_m")
+    return fit.fit_as_paper(circles, task.focus_distance_m, depth_error=error, resamples=resamples)
 
 
 def _of_one_size(measured: list[_Measured]) -> tuple[tuple[int, int], list[_Measured]]:
@@ -261,8 +277,8 @@ def _circles(measured: list[_Measured], placement: Placement) -> fit.Circles:
     counts = [len(one.circles) for one in measured]
     return fit.Circles(
         np.concatenate(placement.depth_m),
-        np.concatenate([one.blur_px for one in measured]),
-        np.concatenate([one.error_px for one in measured]),
+        np.concatenate([one.blur_px() for one in measured]),
+        np.concatenate([[edge.blur_error_px for edge in one.edges] for one in measured]),
         np.repeat(np.arange(len(measured)), counts),
         np.repeat([one.report.role == "focused" for one in measured], counts),
     )

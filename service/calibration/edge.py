@@ -7,7 +7,8 @@ pixel's own box and all else that is gamma has its part.
 """
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from typing import Literal
 
@@ -20,7 +21,7 @@ from scipy.special import chndtr, ndtr
 Shape = Literal["gaussian", "disc"]
 Array = NDArray[np.float64]
 
-SOFTNESS_PX = 0.6  # of a disc's rim: pixel, demosaic and diffraction are no disc
+ALL_RIM = 0.97  # softness over blur from which there is no disc left to see
 STRAIGHT_BELOW = 1 / 12  # sigmas over radius: an edge's curvature no longer shows
 WIDEST = 1.5
 FAR_SIGMAS = 7.0
@@ -35,6 +36,9 @@ ALIKE_BELOW_PX = 0.9
 SMALL = 1e-3
 PRECISION = 1e-5
 SLICE_LEVEL = 0.95
+SPREAD_DISCS = 24
+SPREAD_FROM = 1.4  # gammas of blur that tell shapes apart
+SOFTNESSES = (0.6, 0.8, 1.0, 1.25, 1.6)  # in gammas
 CLEARLY = 0.9  # a small blur looks alike under both, and the Gaussian is then nearer to what pixels do
 ROBUST_SCALE = 0.02
 PARAMETERS = ("x", "y", "log_radius", "stretch", "slant", "log_blur", "contrast", "white", "white_x", "white_y")
@@ -45,11 +49,32 @@ class EdgeError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
+class Spread:
+    """The shape of a camera's defocus; a disc's rim is a Gaussian of ``softness_px``."""
+
+    shape: Shape
+    softness_px: float = 0.6
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """Pixels about one disc: their light and places [n], within a square of ``side`` px whose corner is given."""
+
+    light: NDArray[np.float32]
+    columns: NDArray[np.int16]
+    rows: NDArray[np.int16]
+    side: int
+    left: int
+    top: int
+
+
+@dataclass(frozen=True, slots=True)
 class EdgeFit:
     """One disc: centre and mean radius in px, semi-axes, and lambda with its standard error, all in px.
 
     ``contrast`` is the part of the light that the black takes away; ``residual`` is the rms of what the fit leaves,
-    as a part of the white. ``values`` are the parameters themselves, to begin from at the next disc.
+    as a part of the white. ``values`` are the parameters themselves, to begin from at the next disc, and ``patch`` the
+    pixels, to fit again.
     """
 
     x_px: float
@@ -61,19 +86,8 @@ class EdgeFit:
     shape: Shape
     contrast: float
     residual: float
-    values: tuple[float, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class _Patch:
-    """Pixels about one disc: their light and places [n], within a square of ``side`` px whose corner is given."""
-
-    light: Array
-    columns: Array
-    rows: Array
-    side: int
-    left: int
-    top: int
+    values: tuple[float, ...] = field(repr=False)
+    patch: Patch = field(repr=False)
 
 
 def fit_edge(
@@ -88,12 +102,36 @@ def fit_edge(
     start = _start(patch, x_px - patch.left, y_px - patch.top, radius_px)
     if like is not None:
         start[2:7] = like.values[2:7]
-    best = _fitted(patch, start, "gaussian")
+    best = _fitted(patch, start, Spread("gaussian"))
     if best.blur_px > ALIKE_BELOW_PX:
-        disc = _fitted(patch, np.array(best.values), "disc")
+        disc = _fitted(patch, np.array(best.values), Spread("disc"))
         best = disc if disc.residual < CLEARLY * best.residual else best
     _check(best, radius_px)
-    return replace(best, x_px=best.x_px + patch.left, y_px=best.y_px + patch.top)
+    return best
+
+
+def fit_again(edge: EdgeFit, spread: Spread) -> EdgeFit:
+    """The same disc under a point spread that is known for its camera.
+
+    Small blur, which looks alike under all, is right only under the right one: a wrong one costs up to eight in a
+    hundred.
+    """
+    return _fitted(edge.patch, np.array(edge.values), spread)
+
+
+def find_spread(edges: Sequence[EdgeFit], gamma_px: float) -> Spread:
+    """The point spread that fits the most blurred of a camera's discs best; a Gaussian if none is clearly blurred.
+
+    A lens's disc is about as soft as gamma, in focus or not.
+    """
+    blurred = sorted(edges, key=lambda edge: edge.blur_px)[-SPREAD_DISCS:]
+    blurred = [edge for edge in blurred if edge.blur_px > SPREAD_FROM * gamma_px]
+    options = [Spread("gaussian"), *(Spread("disc", ratio * gamma_px) for ratio in SOFTNESSES)]
+
+    def left_over(spread: Spread) -> float:
+        return sum(math.log(max(fit_again(edge, spread).residual, 1e-9)) for edge in blurred)
+
+    return min(options, key=left_over) if blurred else options[0]
 
 
 def slice_blur(light: NDArray[np.float32], x_px: float, y_px: float, radius_px: float) -> float:
@@ -115,7 +153,7 @@ def slice_blur(light: NDArray[np.float32], x_px: float, y_px: float, radius_px: 
     return float(scaled[scaled < SLICE_LEVEL].sum()) / math.sqrt(2 * math.pi)
 
 
-def _patch(light: NDArray[np.float32], x_px: float, y_px: float, radius_px: float) -> _Patch:
+def _patch(light: NDArray[np.float32], x_px: float, y_px: float, radius_px: float) -> Patch:
     if radius_px < LEAST_RADIUS_PX:
         raise EdgeError(f"the circle is {2 * radius_px:.1f} px across, too small: {2 * LEAST_RADIUS_PX:g} are needed")
     reach = REACH_RADII * radius_px
@@ -129,10 +167,17 @@ def _patch(light: NDArray[np.float32], x_px: float, y_px: float, radius_px: floa
     chosen = np.flatnonzero(round_)
     if chosen.size > MOST_PIXELS:  # evenly over the disc: any fixed step of pixels would fall in with their rows
         chosen = np.random.default_rng(0).choice(chosen, MOST_PIXELS, replace=False)
-    return _Patch(square.ravel()[chosen], columns[chosen], rows[chosen], max(square.shape), left, top)
+    return Patch(
+        np.asarray(square.ravel()[chosen], np.float32),
+        columns[chosen].astype(np.int16),
+        rows[chosen].astype(np.int16),
+        max(square.shape),
+        left,
+        top,
+    )
 
 
-def _start(patch: _Patch, x: float, y: float, radius: float) -> Array:
+def _start(patch: Patch, x: float, y: float, radius: float) -> Array:
     white = float(np.quantile(patch.light, 0.95))
     if white <= 0:
         raise EdgeError("there is no light around the circle")
@@ -141,14 +186,14 @@ def _start(patch: _Patch, x: float, y: float, radius: float) -> Array:
     return np.array([x, y, math.log(radius), 0, 0, math.log(0.15 * radius), contrast, white, 0, 0])
 
 
-def _fitted(patch: _Patch, start: Array, shape: Shape) -> EdgeFit:
+def _fitted(patch: Patch, start: Array, spread: Spread) -> EdgeFit:
     white, span = start[7], patch.side
     low = np.array([0, 0, math.log(2), -0.8, -0.8, math.log(0.15), 0.0, 0.2 * white, -white, -white])
     high = np.array([span, span, math.log(span), 0.8, 0.8, math.log(span / 3), 1.2, 3 * white, white, white])
 
     @lru_cache(maxsize=2)
     def picture(values: bytes) -> tuple[Array, Array]:
-        return _picture(np.frombuffer(values), patch, shape)
+        return _picture(np.frombuffer(values), patch, spread)
 
     def left_over(values: Array) -> Array:
         return np.asarray((picture(values.tobytes())[0] - patch.light) / white)
@@ -170,17 +215,18 @@ def _fitted(patch: _Patch, start: Array, shape: Shape) -> EdgeFit:
     )
     values, rest = found.x, left_over(found.x)
     at_end: Array = np.asarray(found.jac, np.float64)
-    spread = np.linalg.pinv(at_end.T @ at_end) * 2 * found.cost / max(rest.size - values.size, 1)
+    covariance = np.linalg.pinv(at_end.T @ at_end) * 2 * found.cost / max(rest.size - values.size, 1)
     blur_px = math.exp(values[5])
     radius = math.exp(values[2])
     axes = _semi_axes(radius, values[3], values[4])
     return EdgeFit(
-        *(float(values[0]), float(values[1]), radius, axes, blur_px),
-        blur_error_px=blur_px * math.sqrt(max(float(spread[5, 5]), 0.0)),
-        shape=shape,
+        *(float(values[0]) + patch.left, float(values[1]) + patch.top, radius, axes, blur_px),
+        blur_error_px=blur_px * math.sqrt(max(float(covariance[5, 5]), 0.0)),
+        shape=spread.shape,
         contrast=float(values[6]),
         residual=float(np.sqrt(np.mean(rest**2))),
         values=tuple(values.tolist()),
+        patch=patch,
     )
 
 
@@ -189,7 +235,7 @@ def _semi_axes(radius: float, stretch: float, slant: float) -> tuple[float, floa
     return radius / math.sqrt(1 - amount), radius / math.sqrt(1 + amount)
 
 
-def _picture(values: Array, patch: _Patch, shape: Shape) -> tuple[Array, Array]:
+def _picture(values: Array, patch: Patch, spread: Spread) -> tuple[Array, Array]:
     """The light [n] that the parameters (in the order of ``PARAMETERS``) make, and its slopes [n, parameters]."""
     x, y, log_radius, stretch, slant, log_blur, contrast, white, white_x, white_y = values
     radius = math.exp(log_radius)
@@ -198,7 +244,7 @@ def _picture(values: Array, patch: _Patch, shape: Shape) -> tuple[Array, Array]:
     at = np.linspace(-min(float(-distance.min()) + 1, radius), float(distance.max()) + 1, PROFILE_POINTS)
 
     def table(larger: float, wider: float) -> Array:
-        return _profile(at, radius * math.exp(larger), math.exp(log_blur + wider), shape)
+        return _profile(at, radius * math.exp(larger), math.exp(log_blur + wider), spread)
 
     middle = table(0, 0)
     by_radius = (table(SMALL, 0) - table(-SMALL, 0)) / (2 * SMALL)
@@ -248,11 +294,11 @@ def _distance(u: Array, v: Array, radius: float, stretch: float, slant: float) -
     return distance, by_shape
 
 
-def _profile(at: Array, radius: float, blur_px: float, shape: Shape) -> Array:
+def _profile(at: Array, radius: float, blur_px: float, spread: Spread) -> Array:
     """How much of a point spread at signed distance ``at`` from a circle's edge (outside positive) lies inside it."""
-    if shape == "gaussian":
+    rim = min(spread.softness_px, blur_px)
+    if spread.shape == "gaussian" or rim > ALL_RIM * blur_px:
         return _gaussian_profile(at, radius, blur_px)
-    rim = min(SOFTNESS_PX, 0.7 * blur_px)
     hard = _disc_profile(at, radius, 2 * math.sqrt(blur_px**2 - rim**2))
     step = at[1] - at[0]
     half = math.ceil(4 * rim / step)

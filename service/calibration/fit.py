@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from service.optics import thin_lens
 
@@ -116,7 +116,8 @@ def fit_constants(
 ) -> Constants:
     """The constants with 95 % intervals by a bootstrap over pictures; the focus distance is fitted unless given.
 
-    ``depth_error`` is the relative standard error that all depths have in common, as from the focal length. Raises
+    ``depth_error`` is the relative standard error that all depths have in common, as from the focal length; without
+    ``resamples`` the intervals have no width. Raises
     ``FitError`` for fewer than four circles or for circles that show no blur by defocus.
     """
     defocused = ~circles.is_focused
@@ -182,7 +183,7 @@ def _constants(
         )
     rest = _left_over(best, circles)
     scale = max(1.4826 * float(np.median(np.abs(rest))), 1e-6)
-    drawn = _resampled(circles, fit, best, depth_error, resamples, seed)
+    drawn = _resampled(circles, fit, best, depth_error, resamples, seed) if resamples else best[None]
     pictures = np.unique(circles.picture).size
     widen = _widening(pictures if pictures > 1 else circles.depth_m.size)
     k_cam, gamma, focus = (_interval(best[i], drawn[:, i], widen) for i in range(3))
@@ -264,7 +265,7 @@ def _resampled(
 
 def _widening(groups: int) -> float:
     """What a bootstrap over few groups is too narrow by."""
-    return float(student.ppf((1 + CONFIDENCE) / 2, groups - 1) / 1.96 * math.sqrt(groups / (groups - 1)))
+    return float(stdtrit(groups - 1, (1 + CONFIDENCE) / 2) / 1.96 * math.sqrt(groups / (groups - 1)))
 
 
 def _interval(value: float, drawn: Array, widen: float) -> Interval:

@@ -26,6 +26,7 @@ LEAST_CONVEXITY = 0.85
 LEAST_INERTIA = 0.15
 NEIGHBOURS = 8
 SEEDS = 40
+MOST_TRIES = 16  # at laying a lattice, each from another seed or along other axes
 ANGLES_DEG = (35.0, 145.0)
 LIKE_LENGTH = 2.2
 LIKE_SIZE = 1.6
@@ -126,14 +127,18 @@ def _find(grey: NDArray[np.uint8], grid: CircleGrid) -> FoundGrid:
     blobs = _blobs(grey)
     wanted = _lattice_cells(grid)
     best: dict[Cell, int] = {}
+    tries = 0
     for first, u, v in _seeds(blobs):
         cells = _grown(blobs, first, u, v)
         if len(cells) > len(best):
             best = cells
         if len(cells) >= LEAST_FOUND * len(wanted):
             found = _laid(cells, blobs, wanted, grid)
+            tries += 1
             if found is not None:
                 return found
+            if tries == MOST_TRIES:
+                break
     raise GridError(_why(best, blobs, wanted, grey.shape))
 
 
@@ -259,10 +264,13 @@ def _shifts(cells: dict[Cell, int], wanted: list[Cell], turn: int) -> Iterator[t
     turned = np.array([_moved(cell, turn, (0, 0)) for cell in wanted])
     have = np.array(list(cells))
     low, high = have.min(0) - turned.max(0), have.max(0) - turned.min(0)
-    occupied = set(cells)
+    corner = np.minimum(turned.min(0) + low, have.min(0))
+    occupied = np.zeros(np.maximum(turned.max(0) + high, have.max(0)) - corner + 1, bool)
+    occupied[tuple((have - corner).T)] = True
     for a in range(low[0], high[0] + 1):
         for b in range(low[1], high[1] + 1):
-            hits = sum((int(i) + a, int(j) + b) in occupied for i, j in turned)
+            at = turned + np.array([a, b]) - corner
+            hits = int(occupied[at[:, 0], at[:, 1]].sum())
             if hits >= LEAST_FOUND * len(wanted):
                 yield (a, b), hits
 

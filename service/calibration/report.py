@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from service.calibration.edge import Shape
 from service.calibration.fit import CurvePoint, Interval
-from service.optics.camera import Intrinsics
+from service.optics.camera import Camera, Intrinsics
 
 Role = Literal["focused", "defocused"]
 Method = Literal["edge", "paper"]
@@ -52,7 +53,8 @@ class Sample:
 class Result:
     """The camera's constants with 95 % intervals, in pixels of pictures of this size, and what they rest on.
 
-    ``focus_distance_m`` is an interval of no width where the user gave it.
+    ``focus_distance_m`` is an interval of no width where the user gave it; ``point_spread`` is the shape of defocus
+    that fits the circles better.
     """
 
     image_width_px: int
@@ -60,11 +62,23 @@ class Result:
     k_cam_px: Interval
     gamma_px: Interval
     focus_distance_m: Interval
+    point_spread: Shape
     intrinsics: Intrinsics
     reprojection_rms_px: float
     samples: tuple[Sample, ...]
     curve: tuple[CurvePoint, ...]
     warnings: tuple[str, ...] = ()
+
+    def to_camera(self) -> Camera:
+        """The camera it found, focused as it was."""
+        return Camera(
+            image_width_px=self.image_width_px,
+            image_height_px=self.image_height_px,
+            focus_distance_m=self.focus_distance_m.value,
+            k_cam_px=self.k_cam_px.value,
+            gamma_px=self.gamma_px.value,
+            intrinsics=self.intrinsics,
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from sqlalchemy import Engine
 from sqlalchemy.exc import IntegrityError
 from sqlmodel import Session, col, select
 
-from service.errors import Conflict, NotFound, PreconditionFailed
+from service.errors import BadRequest, Conflict, NotFound, PreconditionFailed
 from service.optics.camera import Camera, Intrinsics, Lens
 from service.storage.engine import reading, writing
 from service.storage.tables import CameraRevisionRow, CameraRow
@@ -113,6 +113,13 @@ class Cameras:
         with writing(self._engine) as session:
             row = _require_row(session, draft.name, expected)
             return _write_revision(session, row, draft, datetime.now(UTC))
+
+    def store_calibrated(self, name: str, camera: Camera) -> CameraRecord:
+        """Make the camera or give it a new revision, as a calibration found it. Raises ``BadRequest`` for no name."""
+        if not re.fullmatch(NAME_PATTERN, name):
+            raise BadRequest(f"'{name[:80]}' is no name for a camera: letters, digits, '.', '_' and '-', 64 at most.")
+        with writing(self._engine) as session:
+            return store_calibrated(session, name, camera)
 
     def delete(self, name: str, expected: Sequence[int] | None = None) -> None:
         """Free the name; the revisions stay. Raises as ``replace`` does."""

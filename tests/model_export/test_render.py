@@ -16,12 +16,11 @@ from model_export.render import (
     blur_levels,
     blur_varying,
     composite,
-    decode_srgb,
-    encode_srgb,
     refocus,
     render_layers,
 )
 from service.optics.camera import Camera
+from service.optics.light import decode_srgb, encode_srgb
 
 CAMERA = Camera(96, 96, 2.0, 3.81, 0.5)
 Map = NDArray[np.float32]

@@ -1,0 +1,150 @@
+"""How right a calibration is: simulated cameras with known constants, and the paper's own protocol for both methods."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.table import Table
+
+from model_export.grids import GRID, GridCamera, draw_camera, draw_pose, photograph
+from model_export.render import DISC
+from service.calibration.calibrate import Picture, Task, calibrate
+from service.calibration.fit import Interval
+from service.calibration.report import Method, Report, Role
+from service.calibration.target import CircleGrid
+from service.optics.camera import Intrinsics
+
+NEAREST, FARTHEST = 0.55, 1.8  # of the focus distance
+PHOTOGRAPHS = (8, 12)
+# Fig. 4 of the paper: its k_cam counts k_r = 1, and its blur is 0.3 of that
+PAPER_NUMBERS = (1.39, 5.61, 8.79, 12.69, 22.67, 35.61)
+PAPER_SIGMA = 0.3
+PAPER_FOCUS_M = 2.0
+PAPER_GRID = CircleGrid("asymmetric_circles", 7, 3, 60.0, 40.0)
+
+Array = NDArray[np.float64]
+Photograph = tuple[str, Role, NDArray[np.uint8]]
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One camera and what its calibration said; ``report.result`` is None where it said why it could not."""
+
+    camera: GridCamera
+    report: Report
+
+    def errors(self) -> tuple[float, float, float] | None:
+        """k_cam and focus distance relative, gamma in px."""
+        found, camera = self.report.result, self.camera
+        if found is None:
+            return None
+        return (
+            found.k_cam_px.value / camera.k_cam_px - 1,
+            found.focus_distance_m.value / camera.focus_distance_m - 1,
+            found.gamma_px.value - camera.gamma_px,
+        )
+
+    def held(self) -> tuple[bool, bool, bool] | None:
+        """Whether the intervals of k_cam, focus distance and gamma hold the truth."""
+        found, camera = self.report.result, self.camera
+        if found is None:
+            return None
+
+        def holds(interval: Interval, truth: float) -> bool:
+            return interval.low <= truth <= interval.high
+
+        return (
+            holds(found.k_cam_px, camera.k_cam_px),
+            holds(found.focus_distance_m, camera.focus_distance_m),
+            holds(found.gamma_px, camera.gamma_px),
+        )
+
+
+def _pictures(taken: Sequence[Photograph]) -> list[Picture]:
+    def loader(pixels: NDArray[np.uint8]) -> Callable[[], NDArray[np.uint8]]:
+        return lambda: pixels
+
+    return [Picture(name, role, loader(pixels)) for name, role, pixels in taken]
+
+
+def random_camera(seed: int) -> Trial:
+    """A random camera's photographs from both sides of its focus, calibrated with nothing known."""
+    rng = np.random.default_rng(seed)
+    camera = draw_camera(rng)
+    focus_m = camera.focus_distance_m
+    count = int(rng.integers(PHOTOGRAPHS[0], PHOTOGRAPHS[1] + 1))
+    taken: list[Photograph] = []
+    for depth_m in np.geomspace(NEAREST * focus_m, FARTHEST * focus_m, count):
+        pose = draw_pose(rng, camera, GRID, float(depth_m))
+        taken.append((f"{depth_m:.2f} m", "defocused", photograph(rng, camera, pose, GRID)))
+    return Trial(camera, calibrate(Task(GRID), _pictures(taken)))
+
+
+def one_thread() -> None:
+    """For worker processes: each has a core."""
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+
+
+def paper_pairs(number: float, pairs: int, seed: int = 0) -> list[tuple[Method, Trial]]:
+    """The paper's protocol: focused and defocused pictures of the sheet at half the focus distance, which is given."""
+    rng = np.random.default_rng((seed, round(100 * number)))
+    camera = GridCamera(
+        1280,
+        960,
+        PAPER_SIGMA * number,
+        0.6,
+        PAPER_FOCUS_M,
+        Intrinsics(1050.0, 1050.0, 639.5, 479.5, (-0.05, 0.02, 0.0, 0.0, 0.0)),
+        DISC,
+    )
+    taken: list[Photograph] = []
+    for pair in range(pairs):
+        pose = draw_pose(rng, camera, PAPER_GRID, PAPER_FOCUS_M / 2 * rng.uniform(0.95, 1.05))
+        taken.append((f"focused {pair}", "focused", photograph(rng, camera, pose, PAPER_GRID, focused=True)))
+        taken.append((f"defocused {pair}", "defocused", photograph(rng, camera, pose, PAPER_GRID)))
+    methods: tuple[Method, ...] = ("edge", "paper")
+    return [
+        (method, Trial(camera, calibrate(Task(PAPER_GRID, PAPER_FOCUS_M, method), _pictures(taken))))
+        for method in methods
+    ]
+
+
+def error_table(trials: Sequence[Trial]) -> Table:
+    """The distribution of errors over cameras, by point spread, and how often the intervals hold."""
+    table = Table("point spread", "cameras", "answered", "error of", "median", "95th percentile", "worst", "holds")
+    groups = {"disc": [t for t in trials if t.camera.spread == DISC], "gaussian": [], "all": list(trials)}
+    groups["gaussian"] = [t for t in trials if t.camera.spread != DISC]
+    for name, group in groups.items():
+        errors = [found for trial in group if (found := trial.errors()) is not None]
+        held = [found for trial in group if (found := trial.held()) is not None]
+        for i, (what, unit) in enumerate((("k_cam", "%"), ("focus distance", "%"), ("gamma", " px"))):
+            if not errors:
+                continue
+            amount = np.abs([error[i] for error in errors]) * (100 if unit == "%" else 1)
+            figures = [f"{v:.2f}{unit}" for v in (np.median(amount), np.quantile(amount, 0.95), amount.max())]
+            told = [name, str(len(group)), str(len(errors))] if i == 0 else ["", "", ""]
+            table.add_row(*told, what, *figures, f"{np.mean([hold[i] for hold in held]):.0%}")
+    return table
+
+
+def paper_row(number: float, method: Method, trial: Trial) -> list[str]:
+    """One row of the table of the paper's protocol."""
+    found = trial.report.result
+    head = [f"{number:g}", f"{trial.camera.k_cam_px:.3f}", method]
+    if found is None:
+        return [*head, "", "", trial.report.problem or ""]
+    ratio = found.k_cam_px.value / trial.camera.k_cam_px
+    blurred = [
+        s.blur_px / math.hypot(trial.camera.k_cam_px * abs(PAPER_FOCUS_M / s.depth_m - 1), trial.camera.gamma_px)
+        for s in found.samples
+        if s.image.startswith("defocused")
+    ]
+    return [*head, f"{found.k_cam_px.value:.3f}", f"{ratio - 1:+.1%}", f"{float(np.median(blurred)) - 1:+.1%}"]
+
+
+PAPER_HEAD = ("paper's k_cam", "k_cam px", "method", "found px", "error", "lambda reads")

@@ -1,0 +1,87 @@
+"""A calibration from a folder of photographs, for the command line: progress, report, plot and a summary."""
+
+from pathlib import Path
+
+from pydantic import TypeAdapter
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from service.calibration.calibrate import Picture, Task, calibrate
+from service.calibration.fit import Interval
+from service.calibration.report import PictureReport, Report, Role
+from service.inference.images import ImageLimits, read_stored_frame
+
+SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic"})
+REPORT = TypeAdapter(Report)
+
+
+def pictures_in(folder: Path, limits: ImageLimits) -> list[Picture]:
+    """The photographs in ``focused/`` and ``defocused/``; without these folders all of the folder's are defocused.
+
+    Raises ``ValueError`` where there is none.
+    """
+    roles: dict[Role, Path] = {"focused": folder / "focused", "defocused": folder / "defocused"}
+    if not any(place.is_dir() for place in roles.values()):
+        roles = {"defocused": folder}
+    pictures = [_picture(path, role, limits) for role, place in roles.items() for path in _photographs(place)]
+    if not any(picture.role == "defocused" for picture in pictures):
+        raise ValueError(f"no photographs in {roles['defocused']}: {', '.join(sorted(SUFFIXES))} are read")
+    return pictures
+
+
+def _photographs(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)
+
+
+def _picture(path: Path, role: Role, limits: ImageLimits) -> Picture:
+    name = f"{path.parent.name}/{path.name}" if path.parent.name == role else path.name
+    return Picture(name, role, lambda: read_stored_frame(path.read_bytes(), limits))
+
+
+def calibrate_folder(folder: Path, task: Task, limits: ImageLimits, out: Path) -> Report:
+    """Calibrate under a progress bar, print what each photograph gave, and write the report and its plot."""
+    pictures = pictures_in(folder, limits)
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        bar = progress.add_task(f"{len(pictures)} photographs", total=1.0)
+
+        def tell(done: float, _: tuple[PictureReport, ...]) -> None:
+            progress.update(bar, completed=done)
+
+        report = calibrate(task, pictures, tell=tell)
+        progress.update(bar, completed=1.0)
+    Console().print(_table(report))
+    out.write_bytes(REPORT.dump_json(report, indent=1))
+    if report.result is not None:
+        from service.calibration.plot import as_svg
+
+        out.with_suffix(".svg").write_bytes(as_svg(report.result))
+    return report
+
+
+def _table(report: Report) -> Table:
+    table = Table("photograph", "circles", "blur px", "distance m", "tilt deg", "", box=None, pad_edge=False)
+    for picture in report.pictures:
+        figures = ((picture.blur_px, ".2f"), (picture.distance_m, ".3f"), (picture.tilt_deg, ".0f"))
+        shown = ["" if value is None else format(value, form) for value, form in figures]
+        table.add_row(picture.name, str(picture.circles), *shown, "; ".join(picture.warnings))
+    return table
+
+
+def summary(report: Report) -> list[str]:
+    """The constants with their intervals and warnings, a line each."""
+    if report.result is None:
+        return [f"no result: {report.problem}"]
+    result = report.result
+
+    def line(name: str, unit: str, found: Interval) -> str:
+        return f"{name:17s} {found.value:8.4g} {unit:3s} 95 % [{found.low:.4g}, {found.high:.4g}]"
+
+    return [
+        line("k_cam_px", "px", result.k_cam_px),
+        line("gamma_px", "px", result.gamma_px),
+        line("focus_distance_m", "m", result.focus_distance_m),
+        f"{'fx_px':17s} {result.intrinsics.fx_px:8.1f} px  reprojection {result.reprojection_rms_px:.2f} px rms",
+        *(f"warning: {words}" for words in result.warnings),
+    ]
