@@ -113,12 +113,13 @@ def refocused_cases(folder: Path, count: int, camera: Camera = REFERENCE) -> Ite
 
 
 def shuffled_cases(folder: Path, count: int) -> Iterator[Case]:
-    """A control: each frame blurred by the depth of the next one, scored on its own. Nothing can be right here.
+    """A control: each frame blurred by the depth of one half a set away, scored on its own. Nothing can be right here.
 
-    What is answered well all the same was not read from blur.
+    What is answered well all the same was not read from blur. Half a set, because neighbours look alike.
     """
     photos = list(_spread(folder, count))
-    for photo, other in zip(photos, (*photos[1:], photos[0]), strict=True):
+    half = (len(photos) + 1) // 2
+    for photo, other in zip(photos, (*photos[half:], *photos[:half]), strict=True):
         if other.depth_m.shape == photo.depth_m.shape:
             picture = to_pixels(refocus(_encoded(photo), filled(other.depth_m), REFERENCE))
             yield Case(photo.name, picture, _to_limit(photo.depth_m), REFERENCE, "near")
@@ -210,7 +211,7 @@ def _enough(source: CaseSource) -> Iterator[Case]:
 
 def trials(data: Path, quick: bool) -> list[Trial]:
     """The sets that the data folder can serve; a missing folder is a missing set."""
-    few, many, scenes = (2, 4, 12) if quick else (8, 40, 60)
+    few, several, many, scenes = (2, 2, 4, 8) if quick else (8, 20, 40, 60)
     found: list[Trial] = []
 
     def add(name: str, source: CaseSource, *further_modes: str) -> None:
@@ -229,10 +230,11 @@ def trials(data: Path, quick: bool) -> list[Trial]:
         for k_cam_px in (REFERENCE.k_cam_px,) if quick else UNSEEN_K_CAM_PX:
             camera = replace(REFERENCE, k_cam_px=k_cam_px)
             further = ("no k_cam", "k_cam -10%", "k_cam +10%") if camera == REFERENCE else ("no k_cam",)
-            add(f"{folder.name} k_cam {k_cam_px:g}", partial(refocused_cases, folder, many, camera), *further)
-        add(f"{folder.name} shuffled", partial(shuffled_cases, folder, many))
+            count = many if camera == REFERENCE else several
+            add(f"{folder.name} k_cam {k_cam_px:g}", partial(refocused_cases, folder, count, camera), *further)
+        add(f"{folder.name} shuffled", partial(shuffled_cases, folder, several))
         for view in VIEWS:
-            add(f"{folder.name} view {view:g}", partial(narrowed_cases, folder, many, view))
+            add(f"{folder.name} view {view:g}", partial(narrowed_cases, folder, several, view))
     if (data / "d200").is_dir():
         add("d200", partial(d200_cases, data / "d200", 2 * many))
     return found

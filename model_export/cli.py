@@ -140,9 +140,7 @@ def evaluate(
 @bench.command()
 def calibration(
     cameras: Annotated[int, typer.Option(min=0, help="random cameras")] = 100,
-    pairs: Annotated[
-        int, typer.Option(min=0, help="pairs for each k_cam of the paper; 0: none")
-    ] = 20,
+    pairs: Annotated[int, typer.Option(min=0, help="pairs for each k_cam of the paper; 0: none")] = 20,
     workers: Annotated[int, typer.Option(min=1, max=64, help="processes")] = 2,
 ) -> None:
     """Calibrate simulated cameras: errors, intervals, and the paper's Fig. 4 by both methods."""

@@ -1,5 +1,6 @@
 """The command line, run as people run it."""
 
+import json
 import os
 import socket
 import subprocess
@@ -7,11 +8,14 @@ import sys
 from importlib.metadata import EntryPoint, version
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import typer
 
 from service import cli
 from service.storage import schema
+from tests.simulated_sheets import CAMERA, DEPTHS_M, shots
 
 CAMIND = Path(sys.executable).parent / "camind"
 
@@ -92,3 +96,29 @@ EXTRA = typer.Typer()
 @EXTRA.command(name="extra")
 def run_extra() -> None:
     """Do nothing."""
+
+
+def test_a_folder_of_photographs_gives_a_camera(tmp_path: Path) -> None:
+    folder, out = tmp_path / "photos", tmp_path / "found.json"
+    folder.mkdir()
+    for name, _, rgb in shots(CAMERA, DEPTHS_M):
+        cv2.imwrite(str(folder / f"{name}.png"), rgb[:, :, ::-1])
+    pattern = ("--rows", "7", "--columns", "3", "--spacing-mm", "26", "--diameter-mm", "18")
+    done = camind(tmp_path, "calibrate", str(folder), *pattern, "--out", str(out), "--register", "bench")
+    assert done.returncode == 0, done.stderr
+    assert "stored as bench, revision 1" in done.stdout
+    found = json.loads(out.read_text())["result"]
+    assert found["k_cam_px"]["value"] == pytest.approx(CAMERA.k_cam_px, rel=0.04)
+    assert out.with_suffix(".svg").read_bytes().startswith(b"<?xml")
+    assert camind(tmp_path, "cameras", "list").stdout.startswith("bench\tr1\t")
+
+
+def test_a_folder_without_a_calibration_says_why(tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    none = camind(tmp_path, "calibrate", str(tmp_path / "photos"))
+    assert (none.returncode, none.stderr.count("Traceback")) == (2, 0)
+    assert "no photographs" in none.stderr
+    cv2.imwrite(str(tmp_path / "photos" / "grey.png"), np.full((300, 400, 3), 128, np.uint8))
+    grey = camind(tmp_path, "calibrate", str(tmp_path / "photos"), "--out", str(tmp_path / "grey.json"))
+    assert grey.returncode == 1
+    assert "no result: the grid was found in none of the photographs" in grey.stdout

@@ -63,6 +63,7 @@ class _Measured:
 
     report: PictureReport
     size_px: tuple[int, int] = (0, 0)
+    grid: FoundGrid | None = None
     circles: list[int] = field(default_factory=list)
     centres_px: list[tuple[float, float]] = field(default_factory=list)
     edges: list[EdgeFit] = field(default_factory=list)
@@ -115,7 +116,7 @@ def calibrate(
                 teller.at((1 - FITTING_PART) * (number + part) / len(pictures))
 
             at(0.0)
-            one = _measured(task, picture, at)
+            one = _measured(task, picture, at, _partner(picture, measured))
             measured.append(one)
             teller.reports.append(one.report)
         try:
@@ -125,7 +126,16 @@ def calibrate(
     return Report(tuple(one.report for one in measured), result, None)
 
 
-def _measured(task: Task, picture: Picture, at: Callable[[float], None]) -> _Measured:
+def _partner(picture: Picture, measured: list[_Measured]) -> _Measured | None:
+    """The focused picture that this defocused one is the pair of, if it came before: each kind is counted alone."""
+    if picture.role == "focused":
+        return None
+    place_ = sum(one.report.role == "defocused" for one in measured)
+    focused = [one for one in measured if one.report.role == "focused"]
+    return focused[place_] if place_ < len(focused) else None
+
+
+def _measured(task: Task, picture: Picture, at: Callable[[float], None], partner: _Measured | None = None) -> _Measured:
     out = _Measured(PictureReport(picture.name, picture.role, found=False))
     try:
         rgb = picture.load()
@@ -134,16 +144,22 @@ def _measured(task: Task, picture: Picture, at: Callable[[float], None]) -> _Mea
         return out
     out.size_px = (rgb.shape[1], rgb.shape[0])
     grey = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
+    at(0.05)
     try:
-        grid = find_grid(grey, task.grid)
+        out.grid = find_grid(grey, task.grid)
     except GridError as error:
         out.warn(str(error))
-        return out
-    out.report = replace(out.report, found=True, warnings=(*out.report.warnings, *grid.warnings))
+        if partner is None or partner.grid is None or partner.size_px != out.size_px:
+            return out
+        out.grid = partner.grid
+        out.warn("looked for the circles where its focused partner has them")
+    else:
+        out.report = replace(out.report, found=True)
     at(0.1)
-    _measure_circles(task, rgb, grid, out, at)
+    _measure_circles(task, rgb, out.grid, out, at)
     out.report = replace(
         out.report,
+        found=out.report.found or bool(out.circles),
         circles=len(out.circles),
         blur_px=float(np.median(out.blur_px())) if out.edges else None,
     )

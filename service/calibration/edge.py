@@ -30,6 +30,7 @@ LEAST_RADIUS_PX = 4.0
 LEAST_CONTRAST = 0.08
 MOST_RESIDUAL = 0.1
 MOST_STRETCH = 2.5
+MOST_SHIFT, OTHER_SIZE = 0.5, 1.6
 PROFILE_POINTS = 256
 MOST_PIXELS = 2500
 ALIKE_BELOW_PX = 0.9
@@ -106,7 +107,7 @@ def fit_edge(
     if best.blur_px > ALIKE_BELOW_PX:
         disc = _fitted(patch, np.array(best.values), Spread("disc"))
         best = disc if disc.residual < CLEARLY * best.residual else best
-    _check(best, radius_px)
+    _check(best, x_px, y_px, radius_px)
     return best
 
 
@@ -336,10 +337,12 @@ def _disc_profile(at: Array, radius: float, spread_radius: float) -> Array:
     return common / (math.pi * s**2)
 
 
-def _check(fit: EdgeFit, radius_px: float) -> None:
+def _check(fit: EdgeFit, x_px: float, y_px: float, radius_px: float) -> None:
     if fit.contrast < LEAST_CONTRAST:
         raise EdgeError(f"the circle is too faint: it takes away {fit.contrast:.0%} of the light")
     if fit.residual > MOST_RESIDUAL:
         raise EdgeError("what is there does not look like a blurred circle")
-    if not 1 / 1.6 < fit.radius_px / radius_px < 1.6 or fit.semi_axes_px[0] > MOST_STRETCH * fit.semi_axes_px[1]:
+    is_elsewhere = math.dist((fit.x_px, fit.y_px), (x_px, y_px)) > MOST_SHIFT * radius_px
+    is_of_other_size = not 1 / OTHER_SIZE < fit.radius_px / radius_px < OTHER_SIZE
+    if is_elsewhere or is_of_other_size or fit.semi_axes_px[0] > MOST_STRETCH * fit.semi_axes_px[1]:
         raise EdgeError("what is there is not the circle that was looked for")

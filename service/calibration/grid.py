@@ -52,7 +52,6 @@ class FoundGrid:
     centres_px: Array
     radii_px: Array
     seen: NDArray[np.bool_]
-    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +95,7 @@ def _checked(found: FoundGrid, ratio: float, grid: CircleGrid) -> FoundGrid:
         raise GridError(
             f"the circles are too small: {2 * np.median(radii):.1f} px across, {2 * LEAST_RADIUS_PX:g} are needed"
         )
-    return FoundGrid(centres, radii, found.seen, found.warnings)
+    return FoundGrid(centres, radii, found.seen)
 
 
 def homography(grid: CircleGrid, centres_px: Array) -> Array:

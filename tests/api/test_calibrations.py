@@ -18,6 +18,7 @@ from service.app import create_app
 from service.config import Settings
 from tests.fake_calibration import RESULT, SETTINGS, FakeCalibration
 from tests.inference.photographs import corners, jpeg, png
+from tests.simulated_sheets import CAMERA, DEPTHS_M, GRID, shots
 
 PROBLEM = "application/problem+json"
 PATIENCE_S = 15.0
@@ -460,3 +461,25 @@ def test_twelve_megapixels_are_within_the_limits() -> None:
     assert settings.max_image_pixels >= 4080 * 3072
     assert settings.max_calibration_bytes >= 40 * 12_000_000
     assert len(jpeg(corners())) < settings.max_image_bytes
+
+
+def test_photographs_of_a_sheet_become_a_camera_that_depth_can_use(settings: Settings) -> None:
+    """The calibration itself, from JPEG bytes to the registered camera and its plot."""
+    whole = Settings(data_dir=settings.data_dir, model_dir=settings.model_dir)
+    given = {
+        "pattern": {"kind": GRID.kind, "rows": 7, "columns": 3, "spacing_mm": 26.0, "diameter_mm": 18.0},
+        "register": True,
+    }
+    parts = [picture(name=f"{name}.jpg", content=jpeg(rgb)) for name, _, rgb in shots(CAMERA, DEPTHS_M)]
+    with TestClient(create_app(whole)) as client:
+        response = send(client, settings_part(given), *parts, prefer="wait=60")
+        assert response.status_code == 200, response.text
+        found = response.json()
+        assert found["state"] == "succeeded", found["problem"]
+        assert [image["found"] for image in found["images"]] == [True] * len(DEPTHS_M)
+        assert found["result"]["point_spread"] == "disc"
+        camera = client.get("/cameras/bench").json()
+        assert camera["k_cam_px"] == pytest.approx(CAMERA.k_cam_px, rel=0.04)
+        assert camera["focus_distance_m"] == pytest.approx(CAMERA.focus_distance_m, rel=0.02)
+        plot = client.get(f"/calibrations/{found['id']}/plot.svg")
+        assert (plot.status_code, plot.headers["content-type"]) == (200, "image/svg+xml")

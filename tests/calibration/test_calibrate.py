@@ -1,54 +1,37 @@
 """Whole calibrations, on photographs simulated with the project's renderer; and what goes wrong with photographs."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from model_export.grids import GridCamera, draw_pose, photograph
 from service.calibration.calibrate import Picture, Task, calibrate
 from service.calibration.plot import as_svg
-from service.calibration.report import PictureReport, Report, Role
-from service.calibration.target import CircleGrid
+from service.calibration.report import PictureReport, Report
 from service.errors import InvalidImage
-from service.optics.camera import Intrinsics
-
-GRID = CircleGrid("asymmetric_circles", 7, 3, 26.0, 18.0)
-CAMERA = GridCamera(800, 600, 4.0, 0.7, 0.5, Intrinsics(900, 900, 400, 300, (-0.05, 0.02, 0, 0, 0)))
-DEPTHS_M = (0.34, 0.4, 0.46, 0.6, 0.75, 0.9)
+from tests.simulated_sheets import CAMERA, DEPTHS_M, GRID, Shot, shots
 
 
 class Stopped(Exception):  # noqa: N818 - an outcome, not a fault
     pass
 
 
-def shots(
-    camera: GridCamera, depths_m: Sequence[float], role: Role = "defocused", seed: int = 0
-) -> list[tuple[str, Role, NDArray[np.uint8]]]:
-    rng = np.random.default_rng(seed)
-    return [
-        (
-            f"{role} at {z} m",
-            role,
-            photograph(rng, camera, draw_pose(rng, camera, GRID, z), GRID, focused=role == "focused"),
-        )
-        for z in depths_m
-    ]
+def pictures(taken: Sequence[Shot]) -> list[Picture]:
+    def loader(pixels: NDArray[np.uint8]) -> Callable[[], NDArray[np.uint8]]:
+        return lambda: pixels
 
-
-def pictures(taken: Sequence[tuple[str, Role, NDArray[np.uint8]]]) -> list[Picture]:
-    return [Picture(name, role, lambda pixels=pixels: pixels) for name, role, pixels in taken]  # type: ignore[misc]
+    return [Picture(name, role, loader(pixels)) for name, role, pixels in taken]
 
 
 @pytest.fixture(scope="module")
-def taken() -> list[tuple[str, Role, NDArray[np.uint8]]]:
+def taken() -> list[Shot]:
     return shots(CAMERA, DEPTHS_M)
 
 
 @pytest.fixture(scope="module")
-def report(taken: list[tuple[str, Role, NDArray[np.uint8]]]) -> Report:
+def report(taken: list[Shot]) -> Report:
     return calibrate(Task(GRID), pictures(taken))
 
 
@@ -92,14 +75,16 @@ def test_pairs_as_in_the_paper_by_both_methods() -> None:
     assert 1.25 < paper.k_cam_px.value / 4.0 < 1.6
 
 
-def test_a_portrait_among_landscapes_is_turned(taken: list[tuple[str, Role, NDArray[np.uint8]]]) -> None:
-    turned = [(name, role, np.rot90(p, -1).copy() if i == 2 else p) for i, (name, role, p) in enumerate(taken)]
+def test_a_portrait_among_landscapes_is_turned(taken: list[Shot]) -> None:
+    turned: list[Shot] = [
+        (name, role, np.rot90(p, -1).copy() if i == 2 else p) for i, (name, role, p) in enumerate(taken)
+    ]
     found = calibrate(Task(GRID), pictures(turned)).result
     assert found is not None
     assert found.k_cam_px.value == pytest.approx(4.0, rel=0.04)
 
 
-def test_all_in_focus_is_a_problem_and_no_k_cam(taken: list[tuple[str, Role, NDArray[np.uint8]]]) -> None:
+def test_all_in_focus_is_a_problem_and_no_k_cam(taken: list[Shot]) -> None:
     sharp = replace(CAMERA, k_cam_px=1e-3)
     report = calibrate(Task(GRID), pictures(shots(sharp, (0.4, 0.5, 0.6, 0.7))))
     assert report.result is None
@@ -108,27 +93,27 @@ def test_all_in_focus_is_a_problem_and_no_k_cam(taken: list[tuple[str, Role, NDA
     assert calibrate(Task(GRID), pictures(taken[:1])).result is None
 
 
-def test_another_camera_among_them_is_left_out_or_warned_of(taken: list[tuple[str, Role, NDArray[np.uint8]]]) -> None:
+def test_another_camera_among_them_is_left_out_or_warned_of(taken: list[Shot]) -> None:
     other = replace(CAMERA, intrinsics=replace(CAMERA.intrinsics, fx_px=1400, fy_px=1400))
-    strange = [("strange", role, pixels) for _, role, pixels in shots(other, (0.7,))]
+    strange: list[Shot] = [("strange", role, pixels) for _, role, pixels in shots(other, (0.7,))]
     report = calibrate(Task(GRID), pictures([*taken, *strange]))
     told = [*report.pictures[-1].warnings, *(report.result.warnings if report.result else ())]
     assert told
-    small = [("small", "defocused", np.ascontiguousarray(taken[0][2][::2, ::2]))]
+    small: list[Shot] = [("small", "defocused", np.ascontiguousarray(taken[0][2][::2, ::2]))]
     report = calibrate(Task(GRID), pictures([*taken, *small]))
     assert "left out: 400x300 px, while most are 800x600" in report.pictures[-1].warnings
     assert report.result is not None
 
 
-def test_what_is_no_photograph_is_said_and_the_others_count(taken: list[tuple[str, Role, NDArray[np.uint8]]]) -> None:
+def test_what_is_no_photograph_is_said_and_the_others_count(taken: list[Shot]) -> None:
     def broken() -> NDArray[np.uint8]:
         raise InvalidImage("The file is empty.")
 
-    blank = [("blank", "defocused", np.full((600, 800, 3), 90, np.uint8))]
-    bright = [("bright", "defocused", np.minimum(taken[1][2].astype(int) * 2, 255).astype(np.uint8))]
+    blank: list[Shot] = [("blank", "defocused", np.full((600, 800, 3), 90, np.uint8))]
+    bright: list[Shot] = [("bright", "defocused", np.minimum(taken[1][2].astype(int) * 2, 255).astype(np.uint8))]
     report = calibrate(
         Task(GRID),
-        [Picture("empty", "defocused", broken), *pictures(blank + bright + taken)],  # type: ignore[operator]
+        [Picture("empty", "defocused", broken), *pictures(blank + bright + taken)],
     )
     assert report.pictures[0].warnings == ("The file is empty.",)
     assert report.pictures[1].warnings == ("no grid of dark circles was found",)
@@ -138,7 +123,7 @@ def test_what_is_no_photograph_is_said_and_the_others_count(taken: list[tuple[st
     assert "3 of 9 photographs were of no use" in report.result.warnings[0]
 
 
-def test_it_tells_how_far_it_is_and_can_be_stopped(taken: list[tuple[str, Role, NDArray[np.uint8]]]) -> None:
+def test_it_tells_how_far_it_is_and_can_be_stopped(taken: list[Shot]) -> None:
     told: list[tuple[float, tuple[PictureReport, ...]]] = []
     calls = 0
 
