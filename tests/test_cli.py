@@ -121,4 +121,4 @@ def test_a_folder_without_a_calibration_says_why(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "photos" / "grey.png"), np.full((300, 400, 3), 128, np.uint8))
     grey = camind(tmp_path, "calibrate", str(tmp_path / "photos"), "--out", str(tmp_path / "grey.json"))
     assert grey.returncode == 1
-    assert "no result: the grid was found in none of the photographs" in grey.stdout
+    assert "no result: the circles could be measured in none of the photographs" in grey.stdout

@@ -147,6 +147,9 @@ class ResultRead(BaseModel):
     reprojection_rms_px: Annotated[float, Field(description="How well the circles' places fit the lens")]
     samples: list[SampleRead]
     curve: Annotated[list[CurvePointRead], Field(description="The fitted blur over the distances measured")]
+    corner_ratio: Annotated[
+        float | None, Field(description="k_cam in the corners over that in the middle; null where too few circles were")
+    ]
     warnings: list[str]
 
 

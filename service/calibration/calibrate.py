@@ -31,6 +31,7 @@ PAPER_FROM_RADII, PAPER_TO_RADII = 1.3, 1.6
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 BAD_VIEW = 4.0
 LEAST_BAD_PX = 1.5
+LEAST_CIRCLES = 8
 CENTRE_TO, CORNER_FROM = 0.4, 0.7
 FIELD_DIFFERENCE = 0.1
 LEAST_FIELD_CIRCLES = 12
@@ -189,6 +190,8 @@ def _measure_circles(
         out.edges.append(edge)
     for reason, count in reasons.most_common(3):
         out.warn(f"{count} of {len(grid.radii_px)} circles not measured: {reason}")
+    if 0 < len(out.circles) < LEAST_CIRCLES:
+        out.warn(f"left out: {len(out.circles)} circles do not place the sheet, {LEAST_CIRCLES} are needed")
 
 
 def _light_about(rgb: NDArray[np.uint8], grid: FoundGrid) -> tuple[int, int, NDArray[np.float32], NDArray[np.uint8]]:
@@ -228,6 +231,7 @@ def _fitted(task: Task, measured: list[_Measured], at: Callable[[float], None]) 
     for one in usable:
         one.report = replace(one.report, blur_px=float(np.median(one.blur_px())))
     samples = tuple(_samples(usable, circles, constants))
+    corners = _corner_ratio(samples, placement, size_px)
     return Result(
         *size_px,
         k_cam_px=constants.k_cam_px,
@@ -238,11 +242,12 @@ def _fitted(task: Task, measured: list[_Measured], at: Callable[[float], None]) 
         reprojection_rms_px=placement.overall_rms_px,
         samples=samples,
         curve=constants.curve,
+        corner_ratio=corners,
         warnings=(
             *_left_out(measured, usable),
             *placement.warnings,
             *constants.warnings,
-            *_over_field(samples, placement, size_px),
+            *_uneven(corners),
         ),
     )
 
@@ -260,9 +265,9 @@ def _constants(
 
 def _of_one_size(measured: list[_Measured]) -> tuple[tuple[int, int], list[_Measured]]:
     """Most pictures' size and those that have it, upright ones among them turned to lie as the others do."""
-    with_circles = [one for one in measured if one.circles]
+    with_circles = [one for one in measured if len(one.circles) >= LEAST_CIRCLES]
     if not with_circles:
-        raise PoseError("the grid was found in none of the photographs: see what each of them says")
+        raise PoseError("the circles could be measured in none of the photographs: see what each of them says")
     size_px = Counter(one.size_px for one in with_circles).most_common(1)[0][0]
     usable = []
     for one in with_circles:
@@ -324,17 +329,20 @@ def _left_out(measured: list[_Measured], usable: list[_Measured]) -> Iterator[st
         yield f"{len(measured) - len(usable)} of {len(measured)} photographs were of no use: see what each of them says"
 
 
-def _over_field(samples: tuple[Sample, ...], placement: Placement, size_px: tuple[int, int]) -> Iterator[str]:
-    """A warning if the corners are blurred otherwise than the middle."""
+def _corner_ratio(samples: tuple[Sample, ...], placement: Placement, size_px: tuple[int, int]) -> float | None:
+    """k_cam in the corners over that in the middle; None where too few circles were."""
     middle, reach = (placement.intrinsics.cx_px, placement.intrinsics.cy_px), math.hypot(*size_px) / 2
     told = [
         (math.dist((sample.u_px, sample.v_px), middle) / reach, sample.k_cam_px)
         for sample in samples
         if sample.used and sample.k_cam_px is not None
     ]
-    centre = [k for away, k in told if away < CENTRE_TO]
-    corner = [k for away, k in told if away > CORNER_FROM]
-    if min(len(centre), len(corner)) >= LEAST_FIELD_CIRCLES:
-        ratio = float(np.median(corner) / np.median(centre))
-        if abs(ratio - 1) > FIELD_DIFFERENCE:
-            yield f"k_cam_px in the corners is {ratio:.2f} times that in the middle: the lens blurs unevenly"
+    centre = [k_cam for away, k_cam in told if away < CENTRE_TO]
+    corner = [k_cam for away, k_cam in told if away > CORNER_FROM]
+    enough = min(len(centre), len(corner)) >= LEAST_FIELD_CIRCLES
+    return float(np.median(corner) / np.median(centre)) if enough else None
+
+
+def _uneven(corner_ratio: float | None) -> Iterator[str]:
+    if corner_ratio is not None and abs(corner_ratio - 1) > FIELD_DIFFERENCE:
+        yield f"k_cam_px in the corners is {corner_ratio:.2f} times that in the middle: the lens blurs unevenly"

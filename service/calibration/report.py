@@ -54,7 +54,7 @@ class Result:
     """The camera's constants with 95 % intervals, in pixels of pictures of this size, and what they rest on.
 
     ``focus_distance_m`` is an interval of no width where the user gave it; ``point_spread`` is the shape of defocus
-    that fits the circles better.
+    that fits the circles better; ``corner_ratio`` is k_cam in the corners over that in the middle, if both were seen.
     """
 
     image_width_px: int
@@ -67,6 +67,7 @@ class Result:
     reprojection_rms_px: float
     samples: tuple[Sample, ...]
     curve: tuple[CurvePoint, ...]
+    corner_ratio: float | None = None
     warnings: tuple[str, ...] = ()
 
     def to_camera(self) -> Camera:
