@@ -466,7 +466,7 @@ def test_twelve_megapixels_are_within_the_limits() -> None:
 def test_photographs_of_a_sheet_become_a_camera_that_depth_can_use(settings: Settings) -> None:
     """The calibration itself, from JPEG bytes to the registered camera and its plot."""
     whole = Settings(data_dir=settings.data_dir, model_dir=settings.model_dir)
-    given = {
+    given: dict[str, JsonValue] = {
         "pattern": {"kind": GRID.kind, "rows": 7, "columns": 3, "spacing_mm": 26.0, "diameter_mm": 18.0},
         "register": True,
     }
