@@ -1,4 +1,4 @@
-"""What training adds to the command ``camind``: train, export, verify, evaluate, bench, blender."""
+"""What training adds to the command ``camind``: train, average, export, verify, evaluate, bench, blender."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -65,6 +65,25 @@ def train(
     except FileNotFoundError as exc:
         raise _fail(str(exc)) from exc
     typer.echo(path)
+
+
+@commands.command()
+def average(
+    first: Annotated[Path, typer.Argument(help="checkpoint file", exists=True, dir_okay=False)],
+    second: Annotated[Path, typer.Argument(help="checkpoint file", exists=True, dir_okay=False)],
+    out: Annotated[Path, typer.Option(help="checkpoint file to write", dir_okay=False)],
+    share: Annotated[float, typer.Option(min=0, max=1, help="the second's part")] = 0.5,
+) -> None:
+    """Mean of the weights of two checkpoints, one trained on from the other."""
+    with _training_parts():
+        from model_export.train import Checkpoint
+
+    try:
+        mean = Checkpoint.load(first).averaged(Checkpoint.load(second), share)
+    except ValueError as exc:
+        raise _fail(str(exc)) from exc
+    mean.save(out)
+    typer.echo(out)
 
 
 @commands.command()

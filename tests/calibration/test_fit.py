@@ -1,5 +1,7 @@
 """The joint fit, on circles whose camera is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -67,13 +69,16 @@ def test_one_side_is_said_and_stated_wide() -> None:
     assert given.focus_distance_m.low == given.focus_distance_m.high == pytest.approx(FOCUS)
 
 
-def test_pictures_all_in_focus_are_said() -> None:
-    found = fit_constants(circles((1.18, 1.2, 1.22)), FOCUS, resamples=10)
-    assert any("no circle is blurred" in warning for warning in found.warnings)
+def test_little_defocus_is_said_and_none_is_an_error() -> None:
+    some = circles((1.18, 1.2, 1.22))
+    assert any("little is blurred" in warning for warning in fit_constants(some, FOCUS, resamples=10).warnings)
+    sharp = replace(some, depth_m=np.linspace(1.19, 1.21, some.depth_m.size), blur_px=np.full(some.depth_m.size, GAMMA))
+    with pytest.raises(FitError, match="no circle is blurred"):
+        fit_constants(sharp, FOCUS, resamples=10)
 
 
 def test_too_few_circles_are_an_error_and_one_picture_a_warning() -> None:
-    with pytest.raises(FitError, match="3 circles"):
+    with pytest.raises(FitError, match="3 defocused circles"):
         fit_constants(circles((0.6,), per_picture=3))
     one = fit_constants(circles((0.6,)), FOCUS, resamples=20)
     assert any("fewer than three" in warning for warning in one.warnings)

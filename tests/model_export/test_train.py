@@ -54,6 +54,18 @@ def test_a_run_reports_and_ends_in_a_checkpoint(textures: Path, tmp_path: Path) 
     assert "scenes/s, waited" in said
 
 
+def test_the_mean_of_two_checkpoints_lies_between_them(textures: Path, tmp_path: Path) -> None:
+    first, _ = run(CONFIG, textures, tmp_path / "first")
+    second, _ = run(replace(CONFIG, seed=2), textures, tmp_path / "second")
+    mean = first.averaged(second, 0.25)
+    for name, own in first.modules.items():
+        if own.is_floating_point():
+            torch.testing.assert_close(mean.modules[name], 0.75 * own + 0.25 * second.modules[name])
+    mean.pair()
+    with pytest.raises(ValueError, match="no mean"):
+        first.averaged(replace(second, config=replace(CONFIG, kind="paper")))
+
+
 def test_a_stopped_run_goes_on_as_if_it_had_not_been_stopped(textures: Path, tmp_path: Path) -> None:
     whole, _ = run(CONFIG, textures, tmp_path / "whole")
     (tmp_path / "stopped").mkdir()
