@@ -18,7 +18,8 @@ from service.calibration.report import Method, Report, Role
 from service.calibration.target import CircleGrid
 from service.optics.camera import Intrinsics
 
-NEAREST, FARTHEST = 0.55, 1.8  # of the focus distance
+NEAREST, FARTHEST = 0.6, 1.8  # of the focus distance
+MOST_BLUR = 1 / 3  # of a circle's radius
 PHOTOGRAPHS = (8, 12)
 # Fig. 4 of the paper: its k_cam counts k_r = 1, and its blur is 0.3 of that
 PAPER_NUMBERS = (1.39, 5.61, 8.79, 12.69, 22.67, 35.61)
@@ -72,13 +73,18 @@ def _pictures(taken: Sequence[Photograph]) -> list[Picture]:
 
 
 def random_camera(seed: int) -> Trial:
-    """A random camera's photographs from both sides of its focus, calibrated with nothing known."""
+    """A random camera's photographs from both sides of its focus, calibrated with nothing known.
+
+    As a photographer is told to, the sheet goes no farther from focus than where blur is a third of a radius.
+    """
     rng = np.random.default_rng(seed)
     camera = draw_camera(rng)
     focus_m = camera.focus_distance_m
     count = int(rng.integers(PHOTOGRAPHS[0], PHOTOGRAPHS[1] + 1))
     taken: list[Photograph] = []
-    for depth_m in np.geomspace(NEAREST * focus_m, FARTHEST * focus_m, count):
+    reach_m = MOST_BLUR * GRID.diameter_mm / 2e3 * camera.intrinsics.fx_px / camera.k_cam_px
+    nearest_m, farthest_m = max(NEAREST * focus_m, focus_m - reach_m), min(FARTHEST * focus_m, focus_m + reach_m)
+    for depth_m in np.geomspace(nearest_m, farthest_m, count):
         pose = draw_pose(rng, camera, GRID, float(depth_m))
         taken.append((f"{depth_m:.2f} m", "defocused", photograph(rng, camera, pose, GRID)))
     return Trial(camera, calibrate(Task(GRID), _pictures(taken)))

@@ -53,7 +53,8 @@ class GridPose:
 
 def draw_camera(rng: np.random.Generator, width_px: int = 1280, height_px: int = 960) -> GridCamera:
     """A random camera whose blur can be measured on a sheet of paper."""
-    fx = width_px * rng.uniform(0.9, 1.6)
+    view = rng.uniform(0.9, 1.6)
+    fx = width_px * view
     distortion = (rng.uniform(-0.15, 0.1), rng.uniform(-0.05, 0.05), *rng.uniform(-1e-3, 1e-3, 2).tolist(), 0.0)
     middle = np.array([(width_px - 1) / 2, (height_px - 1) / 2]) + rng.uniform(-0.02, 0.02, 2) * width_px
     return GridCamera(
@@ -61,7 +62,7 @@ def draw_camera(rng: np.random.Generator, width_px: int = 1280, height_px: int =
         height_px,
         k_cam_px=math.exp(rng.uniform(math.log(2.0), math.log(12.0))),
         gamma_px=rng.uniform(0.4, 1.2),
-        focus_distance_m=math.exp(rng.uniform(math.log(0.35), math.log(0.8))),
+        focus_distance_m=view * rng.uniform(0.5, 0.8),  # the sheet fills the picture at about half of it
         intrinsics=Intrinsics(fx, fx * rng.uniform(0.998, 1.002), float(middle[0]), float(middle[1]), distortion),
         spread=DISC if rng.random() < 0.5 else GAUSSIAN,
         vignetting=rng.uniform(0, 0.4),
