@@ -16,6 +16,7 @@ from service.calibration.calibrate import Picture, Task, calibrate
 from service.calibration.fit import Interval
 from service.calibration.report import Method, Report, Role
 from service.calibration.target import CircleGrid
+from service.optics import thin_lens
 from service.optics.camera import Intrinsics
 
 NEAREST, FARTHEST = 0.6, 1.8  # of the focus distance
@@ -25,6 +26,7 @@ PHOTOGRAPHS = (8, 12)
 PAPER_NUMBERS = (1.39, 5.61, 8.79, 12.69, 22.67, 35.61)
 PAPER_SIGMA = 0.3
 PAPER_FOCUS_M = 2.0
+PAPER_DEPTHS_M = np.linspace(0.1, 2.0, 200)
 PAPER_GRID = CircleGrid("asymmetric_circles", 7, 3, 60.0, 40.0)
 
 Array = NDArray[np.float64]
@@ -150,7 +152,15 @@ def paper_row(number: float, method: Method, trial: Trial) -> list[str]:
         for s in found.samples
         if s.image.startswith("defocused")
     ]
-    return [*head, f"{found.k_cam_px.value:.3f}", f"{ratio - 1:+.1%}", f"{float(np.median(blurred)) - 1:+.1%}"]
+    figures = (ratio - 1, float(np.median(blurred)) - 1)
+    return [*head, f"{found.k_cam_px.value:.3f}", *(f"{v:+.1%}" for v in figures), f"{_depth_off(ratio):.1%}"]
 
 
-PAPER_HEAD = ("paper's k_cam", "k_cam px", "method", "found px", "error", "lambda reads")
+def _depth_off(ratio: float) -> float:
+    """Relative rms difference of depths read by a k_cam that is ``ratio`` of the true one, over depths in front."""
+    x = thin_lens.relative_defocus(PAPER_DEPTHS_M, PAPER_FOCUS_M)
+    read_m = thin_lens.depth_near(x / ratio, PAPER_FOCUS_M)
+    return float(np.sqrt(np.mean((read_m / PAPER_DEPTHS_M - 1) ** 2)))
+
+
+PAPER_HEAD = ("paper's k_cam", "k_cam px", "method", "found px", "error", "lambda reads", "depth off")

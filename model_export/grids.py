@@ -7,18 +7,19 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
-from model_export.render import DISC, GAUSSIAN, PIXEL_BOX_VARIANCE, PointSpread, blur, blur_varying
+from model_export.render import DISC, GAUSSIAN, PIXEL_BOX_VARIANCE, PointSpread, blur_varying
 from service.calibration.target import CircleGrid
 from service.optics import thin_lens
 from service.optics.camera import Intrinsics
 from service.optics.light import encode_srgb
 
 GRID = CircleGrid("asymmetric_circles", 11, 4, 20.0, 14.0)
-FINE = 3
 INK, PAPER, TABLE = 0.04, 0.75, 0.25
 SHEET_MARGIN_MM = 15.0
 MARGIN_PX = 48
+LEVEL_RATIO = 1.04
 JPEG_QUALITY = 92
 
 Array = NDArray[np.float64]
@@ -117,18 +118,18 @@ def photograph(
     reached = _reached(sight, pose)
     on_sheet = (reached - pose.shift_m) @ pose.turn
     depth_m = reached[:, 2].reshape(height, width)
-    sharp = _printed(pose, grid, on_sheet[:, :2].reshape(height, width, 2) * 1e3)
-    light = torch.from_numpy(sharp[None])
+    places_mm = on_sheet[:, :2].reshape(height, width, 2) * 1e3
+    light = torch.from_numpy(_printed(pose, grid, places_mm, camera.gamma_px)[None])
     if not focused:
         signed = thin_lens.signed_defocus(depth_m, camera.focus_distance_m) * camera.k_cam_px
-        light = blur_varying(light, torch.from_numpy(np.abs(signed).astype(np.float32)), camera.spread)
-    light = blur(light, math.sqrt(max(camera.gamma_px**2 - PIXEL_BOX_VARIANCE, 0.0)))
+        light = blur_varying(light, torch.from_numpy(np.abs(signed).astype(np.float32)), camera.spread, LEVEL_RATIO)
     inner = light[0].numpy()[margin : margin + camera.height_px, margin : margin + camera.width_px]
     v, u = np.indices(inner.shape)
     away = (
         np.hypot(u - camera.width_px / 2, v - camera.height_px / 2) / math.hypot(camera.width_px, camera.height_px) * 2
     )
-    picture = np.repeat((inner * (1 - camera.vignetting * away**2))[..., None], 3, axis=2)
+    falling = np.maximum(inner, 0) * (1 - camera.vignetting * away**2)  # a convolution by FFT can leave -1e-8
+    picture = np.repeat(falling[..., None], 3, axis=2)
     noisy = picture + camera.noise * np.sqrt(PAPER * picture) * rng.standard_normal(picture.shape)
     pixels = (encode_srgb(noisy.astype(np.float32)) * 255 + 0.5).astype(np.uint8)
     packed = cv2.imencode(".jpg", pixels[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
@@ -147,30 +148,42 @@ def _reached(sight: Array, pose: GridPose) -> Array:
     return sight * ((normal @ pose.shift_m) / (sight @ normal))[:, None]
 
 
-def _printed(pose: GridPose, grid: CircleGrid, places_mm: Array) -> NDArray[np.float32]:
-    """Light [h,w] of the sharp sheet, each pixel the mean over its square; ``places_mm`` are pixel centres on it."""
-    right = np.gradient(places_mm, axis=1)
-    down = np.gradient(places_mm, axis=0)
+def _printed(pose: GridPose, grid: CircleGrid, places_mm: Array, gamma_px: float) -> NDArray[np.float32]:
+    """Light [h,w] of the sheet in focus, each pixel the mean over its square; ``places_mm`` are pixel centres on it.
+
+    Gamma is exact at the circles' edges, where a filter of pixels could not show so small a blur.
+    """
+    right, down = np.gradient(places_mm, axis=1), np.gradient(places_mm, axis=0)
     points = grid.points_mm()
-    low, high = (
-        points.min(0) - SHEET_MARGIN_MM - grid.diameter_mm / 2,
-        points.max(0) + SHEET_MARGIN_MM + grid.diameter_mm / 2,
-    )
-    total = np.zeros(places_mm.shape[:2], np.float32)
-    offsets = (np.arange(FINE) + 0.5) / FINE - 0.5
-    for a in offsets:
-        for b in offsets:
-            at = places_mm + a * right + b * down
-            inked = _is_inked(grid, at)
-            paper = ((at > low) & (at < high)).all(-1)
-            slope = (at - points.mean(0)) @ np.array(pose.gradient) / (high - low).max()
-            total += np.where(inked, INK, np.where(paper, PAPER, TABLE)) * (1 + slope)
-    return np.asarray(total / FINE**2, np.float32)
+    margin = SHEET_MARGIN_MM + grid.diameter_mm / 2
+    low, high = points.min(0) - margin, points.max(0) + margin
+    from_circle = _from_circle(grid, places_mm)
+    pixel_mm = np.sqrt(np.abs(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]))
+    inked = _edge(from_circle / _along(from_circle, pixel_mm), gamma_px)
+    paper = ((places_mm > low) & (places_mm < high)).all(-1)
+    slope = (places_mm - points.mean(0)) @ np.array(pose.gradient) / (high - low).max()
+    return np.asarray((np.where(paper, PAPER, TABLE) * (1 - inked) + INK * inked) * (1 + slope), np.float32)
 
 
-def _is_inked(grid: CircleGrid, at_mm: Array) -> NDArray[np.bool_]:
-    """Whether places [..., 2] lie in a printed circle."""
-    out = np.zeros(at_mm.shape[:-1], bool)
+def _edge(away_px: Array, gamma_px: float) -> Array:
+    """How much of a pixel [...] at a signed distance from a straight edge is inside, after a Gaussian blur."""
+    sigma = math.sqrt(max(gamma_px**2 - PIXEL_BOX_VARIANCE, 1e-4))
+
+    def total(to: Array) -> Array:
+        t = to / sigma
+        return np.asarray(sigma * (t * ndtr(t) + np.exp(-0.5 * t**2) / math.sqrt(2 * math.pi)))
+
+    return total(0.5 - away_px) - total(-0.5 - away_px)
+
+
+def _along(distance: Array, pixel_mm: Array) -> Array:
+    """How much a signed distance [h,w] changes from pixel to pixel across its edge, mm."""
+    return np.maximum(np.hypot(*np.gradient(distance)), 0.1 * pixel_mm)
+
+
+def _from_circle(grid: CircleGrid, at_mm: Array) -> Array:
+    """Signed distance [...] of places [..., 2] from the edge of the nearest printed circle, mm."""
+    nearest = np.full(at_mm.shape[:-1], np.inf)
     spacing, is_asymmetric = grid.spacing_mm, grid.kind == "asymmetric_circles"
     rows = np.rint(at_mm[..., 1] / spacing)
     for step in (-1, 0, 1):
@@ -178,5 +191,6 @@ def _is_inked(grid: CircleGrid, at_mm: Array) -> NDArray[np.bool_]:
         shift = (row % 2) * spacing if is_asymmetric else 0.0
         pitch = 2 * spacing if is_asymmetric else spacing
         column = np.clip(np.rint((at_mm[..., 0] - shift) / pitch), 0, grid.columns - 1)
-        out |= np.hypot(at_mm[..., 0] - column * pitch - shift, at_mm[..., 1] - row * spacing) < grid.diameter_mm / 2
-    return out
+        away = np.hypot(at_mm[..., 0] - column * pitch - shift, at_mm[..., 1] - row * spacing)
+        nearest = np.minimum(nearest, away)
+    return nearest - grid.diameter_mm / 2

@@ -110,19 +110,23 @@ def blur(image: Tensor, sigma_px: float, spread: PointSpread = GAUSSIAN) -> Tens
     return out
 
 
-def blur_levels(low_px: float, high_px: float) -> list[float]:
+def blur_levels(low_px: float, high_px: float, ratio: float = LEVEL_RATIO) -> list[float]:
     """Standard deviations from low to high, close enough for a linear mix of two to pass for one between."""
     span = math.log((high_px + LEVEL_OFFSET_PX) / (low_px + LEVEL_OFFSET_PX))
-    count = max(1, math.ceil(span / math.log(LEVEL_RATIO))) + 1
+    count = max(1, math.ceil(span / math.log(ratio))) + 1
     if high_px - low_px < 0.02:
         return [(low_px + high_px) / 2]
     base = low_px + LEVEL_OFFSET_PX
     return [base * math.exp(span * i / (count - 1)) - LEVEL_OFFSET_PX for i in range(count)]
 
 
-def blur_varying(image: Tensor, sigma_px: Tensor, spread: PointSpread) -> Tensor:
-    """Blur [c,h,w] by a point spread whose sigma [h,w] varies slowly: levels mixed so that variance is exact."""
-    levels = blur_levels(float(sigma_px.min()), float(sigma_px.max()))
+def blur_varying(image: Tensor, sigma_px: Tensor, spread: PointSpread, ratio: float = LEVEL_RATIO) -> Tensor:
+    """Blur [c,h,w] by a point spread whose sigma [h,w] varies slowly: levels mixed so that variance is exact.
+
+    Levels are ``ratio`` apart. A mix of two discs is no disc: who asks for its width as a disc's finds it 3.5 % too
+    wide at the default, 1 % at 1.06.
+    """
+    levels = blur_levels(float(sigma_px.min()), float(sigma_px.max()), ratio)
     if len(levels) == 1:
         return blur(image, levels[0], spread)
     height, width = image.shape[-2:]

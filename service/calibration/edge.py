@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize_scalar
 from scipy.special import chndtr, ndtr
 
 Shape = Literal["gaussian", "disc"]
@@ -32,6 +32,9 @@ MOST_RESIDUAL = 0.1
 MOST_STRETCH = 2.5
 MOST_SHIFT, OTHER_SIZE = 0.5, 1.6
 PROFILE_POINTS = 256
+BOX_SHOWS_BELOW_PX = 1.2  # a wider blur is as good as a Gaussian of its own width
+PIXEL_BOX_VARIANCE, LEAST_REST_PX = 1 / 12, 0.1
+PIXEL_BOX = ((-math.sqrt(0.15), 5 / 18), (0.0, 8 / 18), (math.sqrt(0.15), 5 / 18))  # the mean over a pixel by Gauss
 MOST_PIXELS = 2500
 ALIKE_BELOW_PX = 0.9
 SMALL = 1e-3
@@ -39,7 +42,7 @@ PRECISION = 1e-5
 SLICE_LEVEL = 0.95
 SPREAD_DISCS = 24
 SPREAD_FROM = 1.4  # gammas of blur that tell shapes apart
-SOFTNESSES = (0.6, 0.8, 1.0, 1.25, 1.6)  # in gammas
+SOFTNESS_BOUNDS, SOFTNESS_STEP = (0.5, 2.0), 0.03  # in gammas
 CLEARLY = 0.9  # a small blur looks alike under both, and the Gaussian is then nearer to what pixels do
 ROBUST_SCALE = 0.02
 PARAMETERS = ("x", "y", "log_radius", "stretch", "slant", "log_blur", "contrast", "white", "white_x", "white_y")
@@ -127,12 +130,18 @@ def find_spread(edges: Sequence[EdgeFit], gamma_px: float) -> Spread:
     """
     blurred = sorted(edges, key=lambda edge: edge.blur_px)[-SPREAD_DISCS:]
     blurred = [edge for edge in blurred if edge.blur_px > SPREAD_FROM * gamma_px]
-    options = [Spread("gaussian"), *(Spread("disc", ratio * gamma_px) for ratio in SOFTNESSES)]
 
     def left_over(spread: Spread) -> float:
         return sum(math.log(max(fit_again(edge, spread).residual, 1e-9)) for edge in blurred)
 
-    return min(options, key=left_over) if blurred else options[0]
+    def of_disc(softness: float) -> float:
+        return left_over(Spread("disc", softness * gamma_px))
+
+    if not blurred:
+        return Spread("gaussian")
+    best = minimize_scalar(of_disc, bounds=SOFTNESS_BOUNDS, method="bounded", options={"xatol": SOFTNESS_STEP})
+    is_disc = best.fun < left_over(Spread("gaussian"))
+    return Spread("disc", float(best.x) * gamma_px) if is_disc else Spread("gaussian")
 
 
 def slice_blur(light: NDArray[np.float32], x_px: float, y_px: float, radius_px: float) -> float:
@@ -242,7 +251,8 @@ def _picture(values: Array, patch: Patch, spread: Spread) -> tuple[Array, Array]
     radius = math.exp(log_radius)
     u, v = patch.columns - x, patch.rows - y
     distance, by_shape = _distance(u, v, radius, stretch, slant)
-    at = np.linspace(-min(float(-distance.min()) + 1, radius), float(distance.max()) + 1, PROFILE_POINTS)
+    far = FAR_SIGMAS * math.exp(log_blur) + 1
+    at = np.linspace(-min(float(-distance.min()) + 1, radius, far), min(float(distance.max()) + 1, far), PROFILE_POINTS)
 
     def table(larger: float, wider: float) -> Array:
         return _profile(at, radius * math.exp(larger), math.exp(log_blur + wider), spread)
@@ -299,7 +309,11 @@ def _profile(at: Array, radius: float, blur_px: float, spread: Spread) -> Array:
     """How much of a point spread at signed distance ``at`` from a circle's edge (outside positive) lies inside it."""
     rim = min(spread.softness_px, blur_px)
     if spread.shape == "gaussian" or rim > ALL_RIM * blur_px:
-        return _gaussian_profile(at, radius, blur_px)
+        if blur_px > BOX_SHOWS_BELOW_PX:
+            return _gaussian_profile(at, radius, blur_px)
+        rest_px = math.sqrt(max(blur_px**2 - PIXEL_BOX_VARIANCE, LEAST_REST_PX**2))
+        parts = [weight * _gaussian_profile(at + place, radius, rest_px) for place, weight in PIXEL_BOX]
+        return np.asarray(sum(parts))
     hard = _disc_profile(at, radius, 2 * math.sqrt(blur_px**2 - rim**2))
     step = at[1] - at[0]
     half = math.ceil(4 * rim / step)

@@ -23,6 +23,7 @@ LEAST_CIRCLES = 4
 FLOOR_PX = 0.02
 FLOOR_PART = 0.02
 RESAMPLES = 200
+SHAPE_ERROR, PIXEL_ERROR_PX = 0.006, 0.01  # of all blur, and of gamma: what is left of simulated lenses' errors
 CONFIDENCE = 0.95
 OUTLIER = 5.0
 LOOSE = 0.2
@@ -61,9 +62,9 @@ class Circles:
         """Those at the given places."""
         return Circles(*(getattr(self, column.name)[where] for column in fields(self)))
 
-    def farther(self, factor: float) -> "Circles":
-        """The same, all depths times a factor."""
-        return replace(self, depth_m=self.depth_m * factor)
+    def scaled(self, *, depth: float, blur: float) -> "Circles":
+        """The same, all depths and all blur times a factor."""
+        return replace(self, depth_m=self.depth_m * depth, blur_px=self.blur_px * blur)
 
     def excess(self, focus_m: float) -> Array:
         """|s1/z - 1|, 0 where the lens was focused on the sheet."""
@@ -249,7 +250,11 @@ def _resampled(
     count: int,
     seed: int,
 ) -> Array:
-    """Constants [count, 3] of pictures drawn with replacement (of circles, if there is one), depths in doubt alike."""
+    """Constants [count, 3] of pictures drawn with replacement (of circles, if there is one).
+
+    What all pictures have in common no drawing shows: depths and blur are in doubt alike, and gamma by what cannot be
+    told from the pixel itself.
+    """
     rng = np.random.default_rng(seed)
     labels = np.unique(circles.picture)
     groups = [np.flatnonzero(circles.picture == label) for label in labels]
@@ -259,8 +264,11 @@ def _resampled(
     for _ in range(count):
         picked = rng.integers(0, len(groups), len(groups))
         some = circles.only(np.concatenate([groups[i] for i in picked]))
-        rows.append(fit(some.farther(math.exp(depth_error * rng.standard_normal())), best))
-    return np.array(rows)
+        depth, blur = np.exp(np.array([depth_error, SHAPE_ERROR]) * rng.standard_normal(2)).tolist()
+        row = fit(some.scaled(depth=depth, blur=blur), best).copy()
+        row[1] += PIXEL_ERROR_PX * rng.standard_normal()
+        rows.append(row)
+    return np.maximum(np.array(rows), 0.0)
 
 
 def _widening(groups: int) -> float:
