@@ -356,7 +356,9 @@ def _check(fit: EdgeFit, x_px: float, y_px: float, radius_px: float) -> None:
         raise EdgeError(f"the circle is too faint: it takes away {fit.contrast:.0%} of the light")
     if fit.residual > MOST_RESIDUAL:
         raise EdgeError("what is there does not look like a blurred circle")
+    if fit.semi_axes_px[0] > MOST_STRETCH * fit.semi_axes_px[1]:
+        raise EdgeError("the sheet is too tilted: the circle is seen as a narrow ellipse")
     is_elsewhere = math.dist((fit.x_px, fit.y_px), (x_px, y_px)) > MOST_SHIFT * radius_px
     is_of_other_size = not 1 / OTHER_SIZE < fit.radius_px / radius_px < OTHER_SIZE
-    if is_elsewhere or is_of_other_size or fit.semi_axes_px[0] > MOST_STRETCH * fit.semi_axes_px[1]:
+    if is_elsewhere or is_of_other_size:
         raise EdgeError("what is there is not the circle that was looked for")

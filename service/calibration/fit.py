@@ -30,6 +30,7 @@ LOOSE = 0.2
 CURVE_POINTS, CURVE_BEYOND = 60, 1.05
 FENCE = 1.5  # quartile ranges beyond the quartiles: outliers as a box plot has them
 LEAST_EXCESS = 0.05
+MISFIT = 0.1
 MUST_SHOW = 0.5  # of gamma, that the largest defocus must reach
 GAMMA_BOUNDS_PX = (0.02, 20.0)
 K_CAM_BOUNDS_PX = (0.01, 2000.0)
@@ -306,6 +307,13 @@ def _warnings(circles: Circles, found: tuple[Interval, Interval, Interval], *, i
         told.append(f"all circles are {side} the focus: photograph both sides, or give the focus distance")
     if max(k_cam.relative_width, focus.relative_width) > LOOSE:
         told.append("the pictures do not separate k_cam_px and focus_distance_m well: see their intervals")
+    model = _model(np.array([k_cam.value, gamma.value, focus.value]), circles)
+    off = float(np.median(np.abs(model / circles.blur_px - 1)))
+    if off > MISFIT:
+        told.append(
+            f"no one curve fits: half of the circles are more than {off:.0%} off it; were all photographs taken by one "
+            "camera, with focus, zoom and aperture locked?"
+        )
     if k_cam.value * float(circles.excess(focus.value).max()) < gamma.value:
         told.append("little is blurred by defocus: move nearer or farther, or open the aperture")
     return told

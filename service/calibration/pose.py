@@ -17,7 +17,10 @@ RIM_POINTS = 48
 LEAST_VIEWS = 2
 FEW_VIEWS = 4
 LITTLE_TILT_DEG = 8.0
-BAD_RMS_PART = 0.05
+BAD_RMS_PART = 0.008  # of the spacing
+FREE_VIEWS, CLEARLY = 6, 0.75
+TELL_BENT_MM = 0.5
+CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-10)
 
 
 class PoseError(Exception):
@@ -60,12 +63,14 @@ def place(grid: CircleGrid, views: Sequence[View], size_px: tuple[int, int]) -> 
             f"{len(views)} photograph{' shows' if len(views) == 1 else 's show'} the grid well enough; {LEAST_VIEWS} "
             f"are the least from which a focal length, and so a distance, can be had, {FEW_VIEWS} or more are better"
         )
-    board = np.column_stack([grid.points_mm(), np.zeros(grid.rows * grid.columns)])
+    flat = np.column_stack([grid.points_mm(), np.zeros(grid.rows * grid.columns)])
     centres = [view.centres_px for view in views]
     for _ in range(BIAS_ROUNDS):
-        solved = _solved(board, views, centres, size_px)
-        centres = [view.centres_px - _bias(board, grid, view, solved, i) for i, view in enumerate(views)]
-    solved = _solved(board, views, centres, size_px)
+        solved = _solved(flat, views, centres, size_px)
+        centres = [view.centres_px - _bias(flat, grid, view, solved, i) for i, view in enumerate(views)]
+    solved = _solved(flat, views, centres, size_px)
+    board, solved = _freed(flat, grid, views, centres, size_px, solved)
+    bent_mm = float(np.linalg.norm(board - flat, axis=1).max())
     turns = [np.asarray(cv2.Rodrigues(turn)[0]) for turn in solved.turns]
     depths = [
         np.asarray((board[view.circles] @ turn.T)[:, 2] + float(shift[2, 0]), np.float64) / 1e3
@@ -88,7 +93,7 @@ def place(grid: CircleGrid, views: Sequence[View], size_px: tuple[int, int]) -> 
         tuple(solved.errors.tolist()),
         solved.rms,
         solved.focal_error,
-        tuple(_warnings(grid, views, solved, tilts)),
+        (*_warnings(grid, views, solved, tilts), *_imperfect(bent_mm)),
     )
 
 
@@ -103,23 +108,70 @@ class _Solved:
     focal_error: float
 
 
-def _solved(board: Array, views: Sequence[View], centres: Sequence[Array], size_px: tuple[int, int]) -> _Solved:
+def _freed(
+    flat: Array,
+    grid: CircleGrid,
+    views: Sequence[View],
+    centres: Sequence[Array],
+    size_px: tuple[int, int],
+    solved: _Solved,
+) -> tuple[Array, _Solved]:
+    """The sheet as it is, found along with the camera (Strobl and Hirzinger 2011), where that fits clearly better.
+
+    Paper bends and printers stretch, by a millimetre. The mean size is kept: which of both is wrong cannot be known.
+    """
+    whole = [i for i, view in enumerate(views) if view.circles.size == len(flat)]
+    if len(whole) < FREE_VIEWS:
+        return flat, solved
+    found = cv2.calibrateCameraRO(
+        [flat[views[i].circles].astype(np.float32) for i in whole],
+        [np.asarray(centres[i], np.float32)[:, None] for i in whole],
+        size_px,
+        grid.columns - 1,
+        solved.matrix.copy(),
+        solved.distortion.copy(),
+        flags=cv2.CALIB_FIX_K3,  # with CALIB_USE_INTRINSIC_GUESS, OpenCV 5.0 fails an assertion of its own
+        criteria=CRITERIA,
+    )
+    board = np.empty_like(flat)
+    board[views[whole[0]].circles] = np.asarray(found[5], np.float64).reshape(-1, 3)
+    board = _laid_over(board, flat)
+    freed = _solved(board, views, centres, size_px, solved)
+    return (board, freed) if freed.rms < CLEARLY * solved.rms else (flat, solved)
+
+
+def _laid_over(board: Array, flat: Array) -> Array:
+    """The points [n, 3] turned, moved and sized to lie as near to the flat ones as they can (Umeyama 1991)."""
+    from_middle, to_middle = board - board.mean(0), flat - flat.mean(0)
+    left, _, right = np.linalg.svd(from_middle.T @ to_middle)
+    turn = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+    size = np.sqrt((to_middle**2).sum() / (from_middle**2).sum())
+    return np.asarray(size * from_middle @ turn + flat.mean(0))
+
+
+def _solved(
+    board: Array,
+    views: Sequence[View],
+    centres: Sequence[Array],
+    size_px: tuple[int, int],
+    near: _Solved | None = None,
+) -> _Solved:
     flags = cv2.CALIB_FIX_K3
     if len(views) < FEW_VIEWS:
         flags |= cv2.CALIB_FIX_K2 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_ASPECT_RATIO
         flags |= cv2.CALIB_FIX_PRINCIPAL_POINT
     start = np.array([[max(size_px), 0, (size_px[0] - 1) / 2], [0, max(size_px), (size_px[1] - 1) / 2], [0, 0, 1]])
-    if len(views) < FEW_VIEWS:
+    if len(views) < FEW_VIEWS or near is not None:
         flags |= cv2.CALIB_USE_INTRINSIC_GUESS
     try:
         rms, matrix, distortion, turns, shifts, deviations, _, errors = cv2.calibrateCameraExtended(
             [board[view.circles].astype(np.float32) for view in views],
             [np.asarray(places, np.float32)[:, None] for places in centres],
             size_px,
-            start.astype(np.float64),
-            np.zeros(5),
+            start.astype(np.float64) if near is None else near.matrix.copy(),
+            np.zeros(5) if near is None else near.distortion.copy(),
             flags=flags,
-            criteria=(cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-10),
+            criteria=CRITERIA,
         )
     except cv2.error as error:
         raise PoseError("the sheets cannot be placed: no camera would see the grid like that") from error
@@ -147,6 +199,15 @@ def _bias(board: Array, grid: CircleGrid, view: View, solved: _Solved, number: i
     cross = outlines[..., 0] * after[..., 1] - outlines[..., 1] * after[..., 0]
     # the centroid of the outline's polygon, from the centre's image
     return np.asarray(((outlines + after) * cross[..., None]).sum(1) / (3 * cross.sum(1))[:, None])
+
+
+def _imperfect(bent_mm: float) -> list[str]:
+    if bent_mm < TELL_BENT_MM:
+        return []
+    return [
+        f"the sheet is bent or unevenly printed: circles are up to {bent_mm:.1f} mm off a flat, even grid; this is "
+        "accounted for, but a flat sheet gives better distances"
+    ]
 
 
 def _warnings(grid: CircleGrid, views: Sequence[View], solved: _Solved, tilts: list[float]) -> list[str]:

@@ -77,6 +77,23 @@ def test_little_defocus_is_said_and_none_is_an_error() -> None:
         fit_constants(sharp, FOCUS, resamples=10)
 
 
+def test_two_lenses_mixed_are_said() -> None:
+    one, other = circles((0.6, 0.9, 1.8, 2.4)), circles((0.62, 0.88, 1.9, 2.5))
+    blur = np.hypot(GAMMA, np.sqrt(other.blur_px**2 - GAMMA**2) * 1.6)
+    mixed = Circles(
+        *(
+            np.concatenate(pair)
+            for pair in (
+                (one.depth_m, other.depth_m),
+                (one.blur_px, blur),
+                (one.blur_error_px, other.blur_error_px),
+                (one.picture, other.picture + 4),
+            )
+        )
+    )
+    assert any("no one curve fits" in warning for warning in fit_constants(mixed, resamples=10).warnings)
+
+
 def test_too_few_circles_are_an_error_and_one_picture_a_warning() -> None:
     with pytest.raises(FitError, match="3 defocused circles"):
         fit_constants(circles((0.6,), per_picture=3))

@@ -1,0 +1,94 @@
+"""Where sheets are placed, on centres whose camera is known; and what is said of too little or of bad views."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from service.calibration.pose import PoseError, View, place
+from service.calibration.target import CircleGrid
+from service.opencv import cv2
+
+GRID = CircleGrid("asymmetric_circles", 11, 4, 20.0, 12.0)
+SIZE = (1280, 960)
+MATRIX = np.array([[1300.0, 0, 650], [0, 1290.0, 470], [0, 0, 1]])
+DISTORTION = np.array([-0.1, 0.05, 1e-3, -1e-3, 0])
+TILTS = ((0.35, 0.0), (-0.3, 0.1), (0.0, 0.4), (0.1, -0.35), (0.2, 0.2), (-0.25, -0.25), (0.05, 0.3), (0.3, -0.1))
+DEPTHS_M = (0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75)
+
+Array = NDArray[np.float64]
+
+
+def flat() -> Array:
+    return np.column_stack([GRID.points_mm(), np.zeros(GRID.rows * GRID.columns)])
+
+
+def views(sheet: Array, count: int = 8, *, noise_px: float = 0.03) -> tuple[list[View], list[Array]]:
+    """The centres of the circles' outlines as photographs show them, and their true depths in metres."""
+    rng = np.random.default_rng(0)
+    angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(60)], 1) * GRID.diameter_mm / 2
+    seen, depths = [], []
+    for (a, b), depth_m in zip(TILTS[:count], DEPTHS_M[:count], strict=True):
+        turn = np.array([a, b, 1.5])
+        rotation = np.asarray(cv2.Rodrigues(turn)[0])
+        shift = np.array([5.0, -8.0, 1e3 * depth_m]) - rotation @ sheet.mean(0)
+        outlines, _ = cv2.projectPoints((sheet[:, None] + rim).reshape(-1, 3), turn, shift, MATRIX, DISTORTION)
+        ellipses = [cv2.fitEllipseDirect(rim_px.astype(np.float32)) for rim_px in outlines.reshape(-1, 60, 2)]
+        centres = np.array([ellipse[0] for ellipse in ellipses]) + noise_px * rng.standard_normal((len(sheet), 2))
+        seen.append(View(np.arange(len(sheet)), centres))
+        depths.append(((sheet @ rotation.T)[:, 2] + shift[2]) / 1e3)
+    return seen, depths
+
+
+def test_the_camera_and_every_circle_s_depth_come_out() -> None:
+    seen, depths = views(flat())
+    found = place(GRID, seen, SIZE)
+    assert found.intrinsics.fx_px == pytest.approx(1300, rel=2e-3)
+    assert found.intrinsics.fy_px == pytest.approx(1290, rel=2e-3)
+    assert (found.intrinsics.cx_px, found.intrinsics.cy_px) == pytest.approx((650, 470), abs=3)
+    for got, true in zip(found.depth_m, depths, strict=True):
+        np.testing.assert_allclose(got, true, rtol=3e-3)
+    assert found.overall_rms_px < 0.06
+    assert found.focal_error < 2e-3
+    assert not found.warnings
+
+
+def test_depth_is_along_the_axis_and_not_along_the_ray() -> None:
+    seen, depths = views(flat())
+    found = place(GRID, seen, SIZE)
+    assert np.ptp(depths[0]) > 0.02, "the sheet is tilted"
+    assert np.corrcoef(found.depth_m[0], depths[0])[0, 1] > 0.9999
+
+
+def test_a_bent_and_stretched_sheet_is_found_and_said() -> None:
+    bent = flat()
+    bent[:, 2] = 3e-4 * (bent[:, 1] - bent[:, 1].mean()) ** 2  # 3 mm at the ends
+    bent[:, 0] *= 1.01
+    seen, depths = views(bent)
+    found = place(GRID, seen, SIZE)
+    assert any("bent or unevenly printed" in warning for warning in found.warnings)
+    assert found.overall_rms_px < 0.1
+    assert found.intrinsics.fx_px == pytest.approx(1300, rel=5e-3)
+    for got, true in zip(found.depth_m, depths, strict=True):
+        np.testing.assert_allclose(got, true, rtol=8e-3)
+
+
+def test_few_views_and_no_tilt_are_said_and_one_view_is_an_error() -> None:
+    seen, _ = views(flat(), 3)
+    assert any("3 usable photographs" in warning for warning in place(GRID, seen, SIZE).warnings)
+    with pytest.raises(PoseError, match="1 photograph shows"):
+        place(GRID, seen[:1], SIZE)
+
+
+def test_two_cameras_mixed_are_said() -> None:
+    seen, _ = views(flat())
+    others = [View(view.circles, (view.centres_px - 480) * 1.3 + 480) for view in seen[::2]]
+    found = place(GRID, [*seen[1::2], *others], SIZE)
+    assert any("one camera" in warning for warning in found.warnings)
+
+
+def test_another_camera_s_view_does_not_fit() -> None:
+    seen, _ = views(flat())
+    seen[3] = View(seen[3].circles, (seen[3].centres_px - 480) * 1.3 + 480)
+    found = place(GRID, seen, SIZE)
+    assert np.argmax(found.rms_px) == 3
