@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from model_export.cases import UNSEEN_K_CAM_PX, Case, trials
 from model_export.metrics import Scores, best_constant, completed, mean_scores, pooled_scores, score
-from service.inference.artifact import load_model_folder
+from service.inference.artifact import ModelFolder, load_model_folder
 from service.inference.cancellation import Cancellation
 from service.inference.depth_map import SIGMA_OF_LAPLACE
 from service.inference.estimator import Estimator
-from service.inference.pair import GraphPair, Stopwatch
+from service.inference.pair import GraphPair, RawMaps, Stopwatch
 from service.optics.camera import Camera
 
 # an unknown camera is taken for the middle one of those that are scored
@@ -34,6 +34,7 @@ BLUR_RANGES_PX = (
     *((0.6, 1.0), (1.0, 8.0)),
 )
 SAMPLED_PIXELS = 3000
+REMEMBERED = 4
 
 Map = NDArray[np.float32]
 
@@ -157,13 +158,29 @@ class Report:
         return {name: round(value, 4) for name, value in kept.items()}
 
 
+class _RememberingPair(GraphPair):
+    """A pair that sees a picture once for all the cameras it is answered for in a row."""
+
+    def __init__(self, folder: ModelFolder, intra_op_threads: int) -> None:
+        super().__init__(folder, intra_op_threads)
+        self._seen: dict[tuple[tuple[int, ...], bytes], RawMaps] = {}
+
+    def see(self, rgb: NDArray[np.uint8], cancellation: Cancellation) -> RawMaps:
+        picture = (rgb.shape, rgb.tobytes())
+        if picture not in self._seen:
+            if len(self._seen) == REMEMBERED:
+                self._seen.pop(next(iter(self._seen)))
+            self._seen[picture] = super().see(rgb, cancellation)
+        return self._seen[picture]
+
+
 class Examiner:
     """A loaded model under examination."""
 
     def __init__(self, model: Path) -> None:
         folder = load_model_folder(model)
         self.name = folder.manifest.name
-        self._pair = GraphPair(folder, intra_op_threads=2)
+        self._pair = _RememberingPair(folder, intra_op_threads=2)
         self._estimator = Estimator(self._pair)
         self._stride = folder.manifest.stride
 

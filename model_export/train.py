@@ -151,7 +151,7 @@ class Checkpoint:
         return cls(config, content["step"], content["modules"], content["optimizer"])
 
     def averaged(self, other: "Checkpoint", share: float = 0.5) -> "Checkpoint":
-        """This one with its weights moved by ``share`` towards those of another run from the same start.
+        """This one with its weights moved by ``share`` towards those of a run that was trained on from it.
 
         Of two such runs the mean is often better than either (Izmailov et al. 2018). Raises ``ValueError`` for
         networks of another kind.
@@ -162,7 +162,7 @@ class Checkpoint:
             name: torch.lerp(own, other.modules[name], share) if own.is_floating_point() else own
             for name, own in self.modules.items()
         }
-        return replace(self, modules=modules)
+        return replace(self, modules=modules, step=self.step + other.step)
 
     def pair(self) -> Pair:
         """The networks with this checkpoint's weights, in evaluation mode."""

@@ -66,13 +66,17 @@ class GraphPair:
         ``camera`` is at the scale of the image, of which this may be a part: a crop changes no blur.
         """
         with stopwatch.stage("blur"):
-            seen = self._blur.run({"image": self._padded(rgb)}, cancellation)
+            seen = self.see(rgb, cancellation)
         with stopwatch.stage("correct"):
             feeds = _corrected(seen, camera, side)
         with stopwatch.stage("depth"):
             told = self._depth.run(feeds, cancellation)
         rows, columns = (-(-size // self.manifest.stride) for size in rgb.shape[:2])
         return {name: (seen | told)[name][0, 0, :rows, :columns] for name in MAPS}
+
+    def see(self, rgb: NDArray[np.uint8], cancellation: Cancellation) -> RawMaps:
+        """What the blur graph says of an image: the same for every camera."""
+        return self._blur.run({"image": self._padded(rgb)}, cancellation)
 
     def _padded(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
         """float32 [1, 3, h, w] in 0..1, mirrored at the right and bottom up to the next multiple."""
