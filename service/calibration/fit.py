@@ -23,7 +23,7 @@ LEAST_CIRCLES = 4
 FLOOR_PX = 0.02
 FLOOR_PART = 0.02
 RESAMPLES = 200
-SHAPE_ERROR, PIXEL_ERROR_PX = 0.006, 0.01  # of all blur, and of gamma: what is left of simulated lenses' errors
+SHAPE_ERROR, PIXEL_ERROR_PX, FOCUS_ERROR = 0.003, 0.005, 5e-4  # of blur, gamma, focus: as simulated lenses show them
 CONFIDENCE = 0.95
 OUTLIER = 5.0
 LOOSE = 0.2
@@ -185,7 +185,7 @@ def _constants(
         )
     rest = _left_over(best, circles)
     scale = max(1.4826 * float(np.median(np.abs(rest))), 1e-6)
-    drawn = _resampled(circles, fit, best, depth_error, resamples, seed) if resamples else best[None]
+    drawn = _resampled(circles, fit, best, focus_m, depth_error, resamples, seed) if resamples else best[None]
     pictures = np.unique(circles.picture).size
     widen = _widening(pictures if pictures > 1 else circles.depth_m.size)
     k_cam, gamma, focus = (_interval(best[i], drawn[:, i], widen) for i in range(3))
@@ -247,16 +247,18 @@ def _resampled(
     circles: Circles,
     fit: Callable[[Circles, Array | None], Array],
     best: Array,
+    focus_m: float | None,
     depth_error: float,
     count: int,
     seed: int,
 ) -> Array:
     """Constants [count, 3] of pictures drawn with replacement (of circles, if there is one).
 
-    What all pictures have in common no drawing shows: depths and blur are in doubt alike, and gamma by what cannot be
-    told from the pixel itself.
+    What all pictures have in common no drawing shows: depths and blur are in doubt alike, gamma by what cannot be told
+    from the pixel itself, and the focus distance unless it is given.
     """
     rng = np.random.default_rng(seed)
+    focus_error = 0.0 if focus_m is not None else FOCUS_ERROR
     labels = np.unique(circles.picture)
     groups = [np.flatnonzero(circles.picture == label) for label in labels]
     if len(groups) == 1:
@@ -268,6 +270,7 @@ def _resampled(
         depth, blur = np.exp(np.array([depth_error, SHAPE_ERROR]) * rng.standard_normal(2)).tolist()
         row = fit(some.scaled(depth=depth, blur=blur), best).copy()
         row[1] += PIXEL_ERROR_PX * rng.standard_normal()
+        row[2] *= 1 + focus_error * rng.standard_normal()
         rows.append(row)
     return np.maximum(np.array(rows), 0.0)
 
