@@ -220,14 +220,15 @@ def _fitted(task: Task, measured: list[_Measured], at: Callable[[float], None]) 
     for one, distance, tilt in zip(usable, placement.distance_m, placement.tilt_deg, strict=True):
         one.report = replace(one.report, distance_m=distance, tilt_deg=tilt)
     circles = _circles(usable, placement)
+    at(0.0)
     constants = _constants(task, circles, placement, resamples=0 if task.method == "edge" else fit.RESAMPLES)
-    spread = find_spread([edge for one in usable for edge in one.edges], constants.gamma_px.value)
+    spread = find_spread([edge for one in usable for edge in one.edges], constants.gamma_px.value, lambda: at(0.1))
     if task.method == "edge":
         for number, one in enumerate(usable):
-            at(number / len(usable))
+            at(0.1 + 0.6 * number / len(usable))
             one.edges = [fit_again(edge, spread) for edge in one.edges]
         circles = _circles(usable, placement)
-        constants = _constants(task, circles, placement)
+        constants = _constants(task, circles, placement, tick=lambda: at(0.8))
     for one in usable:
         one.report = replace(one.report, blur_px=float(np.median(one.blur_px())))
     samples = tuple(_samples(usable, circles, constants))
@@ -253,11 +254,16 @@ def _fitted(task: Task, measured: list[_Measured], at: Callable[[float], None]) 
 
 
 def _constants(
-    task: Task, circles: fit.Circles, placement: Placement, *, resamples: int = fit.RESAMPLES
+    task: Task,
+    circles: fit.Circles,
+    placement: Placement,
+    *,
+    resamples: int = fit.RESAMPLES,
+    tick: Callable[[], None] = lambda: None,
 ) -> fit.Constants:
     error = placement.focal_error
     if task.method == "edge":
-        return fit.fit_constants(circles, task.focus_distance_m, depth_error=error, resamples=resamples)
+        return fit.fit_constants(circles, task.focus_distance_m, depth_error=error, resamples=resamples, tick=tick)
     if task.focus_distance_m is None:
         raise fit.FitError("the paper's method needs the focus distance: give focus_distance_m")
     return fit.fit_as_paper(circles, task.focus_distance_m, depth_error=error, resamples=resamples)

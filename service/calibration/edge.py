@@ -7,7 +7,7 @@ pixel's own box and all else that is gamma has its part.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from typing import Literal
@@ -123,15 +123,16 @@ def fit_again(edge: EdgeFit, spread: Spread) -> EdgeFit:
     return _fitted(edge.patch, np.array(edge.values), spread)
 
 
-def find_spread(edges: Sequence[EdgeFit], gamma_px: float) -> Spread:
+def find_spread(edges: Sequence[EdgeFit], gamma_px: float, tick: Callable[[], None] = lambda: None) -> Spread:
     """The point spread that fits the most blurred of a camera's discs best; a Gaussian if none is clearly blurred.
 
-    A lens's disc is about as soft as gamma, in focus or not.
+    A lens's disc is about as soft as gamma, in focus or not. ``tick`` is called now and then.
     """
     blurred = sorted(edges, key=lambda edge: edge.blur_px)[-SPREAD_DISCS:]
     blurred = [edge for edge in blurred if edge.blur_px > SPREAD_FROM * gamma_px]
 
     def left_over(spread: Spread) -> float:
+        tick()
         return sum(math.log(max(fit_again(edge, spread).residual, 1e-9)) for edge in blurred)
 
     def of_disc(softness: float) -> float:

@@ -115,11 +115,12 @@ def fit_constants(
     depth_error: float = 0.0,
     resamples: int = RESAMPLES,
     seed: int = 0,
+    tick: Callable[[], None] = lambda: None,
 ) -> Constants:
     """The constants with 95 % intervals by a bootstrap over pictures; the focus distance is fitted unless given.
 
     ``depth_error`` is the relative standard error that all depths have in common, as from the focal length; without
-    ``resamples`` the intervals have no width. Raises
+    ``resamples`` the intervals have no width. ``tick`` is called now and then. Raises
     ``FitError`` for fewer than four circles or for circles that show no blur by defocus.
     """
     defocused = ~circles.is_focused
@@ -127,6 +128,7 @@ def fit_constants(
         raise FitError(f"{defocused.sum()} defocused circles were measured; at least {LEAST_CIRCLES} are needed")
 
     def fit(some: Circles, start: Array | None) -> Array:
+        tick()
         return _fitted(some, focus_distance_m, start)
 
     return _constants(circles, fit, focus_distance_m, depth_error, resamples, seed)
