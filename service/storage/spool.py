@@ -38,9 +38,9 @@ class Spool:
     def receiving(self, calibration_id: str) -> Iterator[Path]:
         """A new folder to be filled; it is removed again where that fails."""
         folder = self._folder / calibration_id
-        folder.mkdir()
         self._incoming.add(calibration_id)
         try:
+            folder.mkdir()
             yield folder
         except BaseException:
             self.remove(calibration_id)
@@ -62,8 +62,9 @@ class Spool:
         shutil.rmtree(self._folder / calibration_id, ignore_errors=True)
 
     def ids(self) -> list[str]:
-        """The calibrations that have a folder."""
-        return [path.name for path in self._folder.iterdir() if re.fullmatch(ID_PATTERN, path.name)]
+        """The calibrations that have a folder, but for those being received: the database may not know them yet."""
+        names = [path.name for path in self._folder.iterdir() if re.fullmatch(ID_PATTERN, path.name)]
+        return [name for name in names if name not in self._incoming]
 
     def acquire(self) -> bool:
         """Become the one process that works this spool off; False while another is. Ends with the process."""

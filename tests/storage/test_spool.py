@@ -52,3 +52,10 @@ def test_one_at_a_time_works_it_off(spool: Spool, tmp_path: Path) -> None:
     spool.release()
     assert other.acquire()
     other.release()
+
+
+def test_what_is_being_received_is_nobody_s_orphan(spool: Spool) -> None:
+    """A start's cleaning once took a folder whose row was about to be stored."""
+    with spool.receiving("a" * 32):
+        assert spool.ids() == []
+    assert spool.ids() == ["a" * 32]
