@@ -134,11 +134,15 @@ def evaluate(
     """Score a model on pictures that no training saw, beside the best constant depth of each picture."""
     with _training_parts():
         from model_export import report as reports
+        from model_export.cases import trials
         from model_export.evaluate import evaluate as run_evaluation
 
-    console = Console(stderr=True)
-    with console.status("loading") as status:
-        report = run_evaluation(model, data, quick=quick, on_progress=status.update)
+    sets = trials(data, quick)
+    with progress_bar(Console(stderr=True)) as progress:
+        task = progress.add_task("loading", total=len(sets))
+        report = run_evaluation(
+            model, sets, lambda said, finished: progress.update(task, description=said, advance=finished)
+        )
     stdout = Console()
     if not stdout.is_terminal:
         stdout.width = FILE_COLUMNS

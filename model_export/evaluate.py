@@ -5,14 +5,18 @@ without an answer is scored with the median of the picture's answers, and the sh
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from model_export.cases import UNSEEN_K_CAM_PX, Case, trials
+from model_export.cases import UNSEEN_K_CAM_PX, Case, Trial
 from model_export.metrics import Scores, best_constant, completed, mean_scores, pooled_scores, score
 from service.inference.artifact import ModelFolder, load_model_folder
 from service.inference.cancellation import Cancellation
@@ -35,6 +39,7 @@ BLUR_RANGES_PX = (
 )
 SAMPLED_PIXELS = 3000
 REMEMBERED = 4
+SETS_AT_ONCE = 2
 
 Map = NDArray[np.float32]
 
@@ -179,8 +184,7 @@ class Examiner:
 
     def __init__(self, model: Path) -> None:
         folder = load_model_folder(model)
-        self.name = folder.manifest.name
-        self._pair = _RememberingPair(folder, intra_op_threads=2)
+        self._pair = _RememberingPair(folder, intra_op_threads=1)
         self._estimator = Estimator(self._pair)
         self._stride = folder.manifest.stride
 
@@ -262,20 +266,51 @@ def blur_ranges(name: str, pixels: Pixels) -> list[BlurRange]:
     return found
 
 
-def evaluate(
-    model: Path, data: Path, *, quick: bool = False, on_progress: Callable[[str], None] = lambda _: None
-) -> Report:
-    """Score a model folder on everything below ``data`` and on procedural scenes."""
+@dataclass(frozen=True, slots=True)
+class _Examined:
+    """A trial's outcomes by mode, and its first picture."""
+
+    name: str
+    outcomes: dict[str, list[Outcome]]
+    example: Example | None
+
+
+def _examined(model: Path, on_progress: Callable[[str, int], None], trial: Trial) -> _Examined:
     examiner = Examiner(model)
-    outcomes: dict[tuple[str, str], list[Outcome]] = {}
-    examples: dict[str, Example] = {}
-    for trial in trials(data, quick):
-        for case in trial.cases():
-            for mode in trial.modes:
-                outcome, example = examiner.answer(case, mode)
-                outcomes.setdefault((trial.name, mode), []).append(outcome)
-                examples.setdefault(trial.name, example)
-            on_progress(f"{trial.name}: {case.name}")
+    outcomes: dict[str, list[Outcome]] = {}
+    first: Example | None = None
+    for case in trial.cases():
+        for mode in trial.modes:
+            outcome, example = examiner.answer(case, mode)
+            outcomes.setdefault(mode, []).append(outcome)
+            first = first or example
+        on_progress(f"{trial.name}: {case.name}", 0)
+    on_progress(trial.name, 1)
+    return _Examined(trial.name, outcomes, first)
+
+
+@contextmanager
+def _one_core_each() -> Iterator[None]:
+    """Renderings side by side, rather than each in pieces on every core."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def evaluate(
+    model: Path, trials: Sequence[Trial], on_progress: Callable[[str, int], None] = lambda _said, _finished: None
+) -> Report:
+    """Score a model folder on sets of pictures, two sets at a time.
+
+    ``on_progress`` hears, from any thread, of every picture, and how many sets that finishes.
+    """
+    with _one_core_each(), ThreadPoolExecutor(SETS_AT_ONCE) as pool:
+        done = list(pool.map(partial(_examined, model, on_progress), trials))
+    outcomes = {(e.name, mode): scored for e in done for mode, scored in e.outcomes.items()}
+    examples = {e.name: e.example for e in done if e.example is not None}
     for k_cam_px in UNSEEN_K_CAM_PX:
         for mode in MODES:
             both = [outcomes.get((f"{folder} k_cam {k_cam_px:g}", mode), []) for folder in ("rgbd", "tabletop")]
@@ -286,7 +321,7 @@ def evaluate(
         blur.setdefault(name.split()[0], []).extend(o.blur for o in found if o.blur is not None)
     blur_pixels = {name: Pixels.joined(parts) for name, parts in blur.items() if parts}
     return Report(
-        model=examiner.name,
+        model=load_model_folder(model).manifest.name,
         sets=[summarise(name, mode, found) for (name, mode), found in outcomes.items()],
         blur=[row for name, pixels in blur_pixels.items() for row in blur_ranges(name, pixels)],
         blur_pixels=blur_pixels,

@@ -64,8 +64,9 @@ class DepthNetwork(Protocol):
 
 
 def _gaussian(sigma: float, radius: int) -> Tensor:
+    """Taps [2 radius + 1] that sum to 1; sigma 0 leaves a picture as it is."""
     t = torch.arange(-radius, radius + 1, dtype=torch.float64)
-    g = torch.exp(-0.5 * (t / sigma) ** 2)
+    g = torch.exp(-0.5 * (t / max(sigma, 1e-6)) ** 2)
     return g / g.sum()
 
 
@@ -74,11 +75,13 @@ class BandEnergy(nn.Module):
 
     Bands are differences of Gaussians on a pyramid whose next level starts where this one's Gaussian has
     doubled, so each octave costs a quarter of the one before; each energy is smoothed at 1.2 px of its level.
+    Every Gaussian is a row and a column.
     """
 
     OCTAVES = 4
     BANDS = 3
     FIRST_SIGMA = 0.6
+    SMOOTH_SIGMA = 1.2
     RADIUS = 4
     FLOOR = 1e-6
     first: Tensor
@@ -89,41 +92,35 @@ class BandEnergy(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         sigmas = [self.FIRST_SIGMA * 2 ** (i / self.BANDS) for i in range(self.BANDS + 1)]
-        first = [torch.outer(g, g) for g in (_gaussian(s, self.RADIUS) for s in sigmas)]
         # later levels start from a picture that is blurred by FIRST_SIGMA already
         more = [max(s * s - self.FIRST_SIGMA**2, 0.0) ** 0.5 for s in sigmas]
-        delta = torch.zeros(2 * self.RADIUS + 1, dtype=torch.float64)
-        delta[self.RADIUS] = 1
-        rest = [torch.outer(g, g) for g in (_gaussian(s, self.RADIUS) if s else delta for s in more)]
-        self.register_buffer("first", self._kernels(first))
-        self.register_buffer("rest", self._kernels(rest))
-        smooth = _gaussian(1.2, self.RADIUS)
-        self.register_buffer("smooth", torch.outer(smooth, smooth)[None, None].float().repeat(3, 1, 1, 1))
-        self.register_buffer("luminance", torch.tensor(LUMINANCE)[None, :, None, None])
+        self._keep("first", torch.stack([_gaussian(s, self.RADIUS) for s in sigmas]))
+        self._keep("rest", torch.stack([_gaussian(s, self.RADIUS) for s in more]))
+        self._keep("smooth", _gaussian(self.SMOOTH_SIGMA, self.RADIUS).repeat(self.BANDS, 1))
+        self._keep("luminance", torch.tensor(LUMINANCE)[None, :, None, None])
 
-    @staticmethod
-    def _kernels(gaussians: list[Tensor]) -> Tensor:
-        """The bands' kernels, and last the Gaussian that the next level is sampled from."""
-        bands = [fine - coarse for fine, coarse in itertools.pairwise(gaussians)]
-        return torch.stack([*bands, gaussians[-1]])[:, None].float()
+    def _keep(self, name: str, values: Tensor) -> None:
+        self.register_buffer(name, values.float(), persistent=False)
 
     def forward(self, image: Tensor) -> Tensor:
         level = (image * self.luminance).sum(1, keepdim=True)
-        pads = (self.RADIUS,) * 4
         energies = []
         for octave in range(self.OCTAVES):
-            kernels = self.first if octave == 0 else self.rest
-            out = functional.conv2d(functional.pad(level, pads, mode="replicate"), kernels)
-            squared = functional.pad(out[:, : self.BANDS] ** 2, pads, mode="replicate")
-            stride = 2 if octave == 0 else 1
-            energy = functional.conv2d(squared, self.smooth, stride=stride, groups=self.BANDS)
-            energy = torch.log(energy + self.FLOOR)
+            blurred = self._blurred(level, self.first if octave == 0 else self.rest)
+            bands = blurred[:, :-1] - blurred[:, 1:]
+            energy = torch.log(self._blurred(bands**2, self.smooth, stride=2 if octave == 0 else 1) + self.FLOOR)
             if octave > 1:
                 factor = 2.0 ** (octave - 1)
                 energy = functional.interpolate(energy, scale_factor=factor, mode="bilinear", align_corners=False)
             energies.append(energy * 0.25 + 2.0)
-            level = out[:, self.BANDS :, ::2, ::2]
+            level = blurred[:, -1:, ::2, ::2]
         return torch.cat(energies, 1)
+
+    def _blurred(self, maps: Tensor, taps: Tensor, stride: int = 1) -> Tensor:
+        """Maps [n,1 or c,h,w] by the Gaussians of taps [c,t]: [n,c,h/stride,w/stride], edges continued."""
+        padded = functional.pad(maps, (self.RADIUS,) * 4, mode="replicate")
+        rows = functional.conv2d(padded, taps[:, None, None, :], stride=(1, stride), groups=maps.shape[1])
+        return functional.conv2d(rows, taps[:, None, :, None], stride=(stride, 1), groups=taps.shape[0])
 
 
 def conv_block(inputs: int, outputs: int, convolutions: int = 2) -> nn.Sequential:

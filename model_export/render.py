@@ -218,7 +218,8 @@ def refocus(
     sigma = thin_lens.defocus_at_depth(depth_m, camera.focus_distance_m, camera.k_cam_px)
     margin = math.ceil(MARGIN_SIGMAS * (float(sigma.max()) + camera.gamma_px)) + 1
     margin = min(margin, min(depth_m.shape) - 1)
-    pad = ((margin, margin), (margin, margin))
+    height, width = depth_m.shape
+    pad = tuple((margin, cv2.getOptimalDFTSize(size + 2 * margin) - size - margin) for size in (height, width))
     linear = np.pad(decode_srgb(image), (*pad, (0, 0)), mode="reflect")
     sigma = np.pad(sigma, pad, mode="reflect")
     index = np.pad(_slices(signed), pad, mode="reflect")
@@ -234,5 +235,5 @@ def refocus(
 
     rest = math.sqrt(max(camera.gamma_px**2 - PIXEL_BOX_VARIANCE, 0.0))
     picture = blur(composite(blurred()), rest)
-    inner = picture[:, margin : -margin or None, margin : -margin or None]
+    inner = picture[:, margin : margin + height, margin : margin + width]
     return encode_srgb(inner.permute(1, 2, 0).numpy())
