@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from model_export.card import card_text
 from model_export.config import SceneConfig, TrainConfig
+from model_export.folded import folded
 from model_export.networks import BLUR_BOUNDS_PX, MULTIPLE, Features, Pair, Scene, parameter_count
 from model_export.train import Checkpoint
 from service.inference.artifact import (
@@ -76,6 +77,7 @@ def feature_names(count: int) -> tuple[str, ...]:
 def export_graphs(pair: Pair, folder: Path) -> Graphs:
     """Write both graphs for any batch and any size that is a multiple of 16; what the manifest says of them."""
     pair.modules().eval()
+    pair = folded(pair)
     height, width = EXAMPLE_SIZE
     image = torch.rand(2, 3, height, width)
     with torch.inference_mode():

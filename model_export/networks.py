@@ -8,6 +8,7 @@ probability of near, and the log of the relative error. All maps are [n,1,h/s,w/
 
 import itertools
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -23,6 +24,7 @@ LOG_ERROR_BOUNDS = (-5.0, 1.5)
 SPREAD_BOUNDS = (0.01, 2.0)
 RATIO_BOUND = 3.5
 LUMINANCE = (0.299, 0.587, 0.114)
+GREY = 0.5
 
 Features = tuple[Tensor, ...]
 
@@ -138,17 +140,43 @@ class Surroundings(nn.Module):
     def __init__(self, width: int, dilation: int) -> None:
         super().__init__()
         self.convolution = nn.Conv2d(width, width, 3, padding=dilation, dilation=dilation, bias=False)
-        self.norm = nn.BatchNorm2d(width)
-        nn.init.zeros_(self.norm.weight)
+        self.norm: nn.Module = nn.BatchNorm2d(width)
+        nn.init.zeros_(self.norm.get_parameter("weight"))
 
     def forward(self, x: Tensor) -> Tensor:
-        return functional.relu(x + self.norm(self.convolution(x)))
+        change: Tensor = self.norm(self.convolution(x))
+        return functional.relu(x + change)
+
+
+class Stem(nn.ModuleList):
+    """A first block: sees a picture in cells of 2x2, and beside it maps of half its size."""
+
+    def forward(self, image: Tensor, beside: Tensor) -> Tensor:
+        x = torch.cat([pixel_unshuffle(image) - GREY, beside], 1)
+        for layer in self:
+            x = layer(x)
+        return x
+
+
+class Joining(nn.ModuleList):
+    """A block of a decoder: sees the coarser map, of that many channels, at twice its size, and others beside it."""
+
+    def __init__(self, coarse: int, layers: Iterable[nn.Module]) -> None:
+        super().__init__(layers)
+        self.coarse = coarse
+
+    def forward(self, coarse: Tensor, beside: Features) -> Tensor:
+        x = torch.cat([functional.interpolate(coarse, scale_factor=2.0, mode="nearest"), *beside], 1)
+        for layer in self:
+            x = layer(x)
+        return x
 
 
 class UNet(nn.Module):
     """Encoder and decoder with skips; ``joined`` are widths of maps added to the decoder's skips, finest first.
 
-    ``dilations`` are those of the residual convolutions at the coarsest level.
+    ``dilations`` are those of the residual convolutions at the coarsest level. Who ``sees_picture`` takes that and maps
+    of half its size, else the first block takes one map.
     """
 
     def __init__(
@@ -158,26 +186,29 @@ class UNet(nn.Module):
         joined: tuple[int, ...] = (),
         decoder_convolutions: int = 2,
         dilations: tuple[int, ...] = (),
+        sees_picture: bool = False,
     ) -> None:
         super().__init__()
         self.surroundings = nn.Sequential(*(Surroundings(widths[-1], d) for d in dilations))
-        self.encoder = nn.ModuleList(conv_block(a, b) for a, b in zip((inputs, *widths), widths, strict=False))
+        first = conv_block(inputs, widths[0])
+        self.encoder = nn.ModuleList([Stem(first) if sees_picture else first])
+        self.encoder.extend(conv_block(a, b) for a, b in itertools.pairwise(widths))
         extra = joined or (0,) * (len(widths) - 1)
         self.decoder = nn.ModuleList(
-            conv_block(widths[i + 1] + widths[i] + extra[i], widths[i], decoder_convolutions)
+            Joining(widths[i + 1], conv_block(widths[i + 1] + widths[i] + extra[i], widths[i], decoder_convolutions))
             for i in range(len(widths) - 1)
         )
 
-    def forward(self, x: Tensor, joined: Features = ()) -> Features:
+    def forward(self, *inputs: Tensor, joined: Features = ()) -> Features:
         """The encoder's skips, finest first, and last the finest decoder map."""
-        skips: list[Tensor] = []
-        for i, block in enumerate(self.encoder):
-            x = block(x if i == 0 else functional.max_pool2d(x, 2))
+        x = self.encoder[0](*inputs)
+        skips = [x]
+        for block in itertools.islice(self.encoder, 1, None):
+            x = block(functional.max_pool2d(x, 2))
             skips.append(x)
         x = self.surroundings(x)
         for i in reversed(range(len(self.decoder))):
-            up = functional.interpolate(x, scale_factor=2.0, mode="nearest")
-            x = self.decoder[i](torch.cat([up, skips[i], *joined[i : i + 1]], 1))
+            x = self.decoder[i](x, (skips[i], *joined[i : i + 1]))
         return (*skips[:-1], x)
 
 
@@ -205,14 +236,14 @@ class CompactBlur(nn.Module):
         super().__init__()
         self.front = BandEnergy()
         inputs = 12 + BandEnergy.OCTAVES * BandEnergy.BANDS
-        self.unet = UNet(inputs, self.WIDTHS, dilations=self.DILATIONS)
+        self.unet = UNet(inputs, self.WIDTHS, dilations=self.DILATIONS, sees_picture=True)
         self.head = nn.Conv2d(self.WIDTHS[0], 2, 1)
         nn.init.constant_(self.head.get_parameter("bias")[0:1], math.log(2.0))
 
     def forward(self, image: Tensor) -> BlurEstimate:
         with torch.autocast(image.device.type, enabled=False):
             energies = self.front(image.float())
-        features = self.unet(torch.cat([pixel_unshuffle(image) - 0.5, energies], 1))[-1]
+        features = self.unet(image, energies)[-1]
         with torch.autocast(image.device.type, enabled=False):
             out = functional.conv2d(features.float(), self.head.weight, self.head.bias)
         log_blur = out[:, :1].clamp(*(math.log(b) for b in BLUR_BOUNDS_PX))
@@ -291,7 +322,7 @@ class PaperDepth(nn.Module):
 
     def forward(self, defocus: Tensor, _spread: Tensor, scene: Scene, features: Features) -> DepthEstimate:
         inputs = torch.cat([defocus.clamp(max=8.0), _plane(scene.focus_distance_m, defocus)], 1)
-        x = self.unet(inputs, features)[-1]
+        x = self.unet(inputs, joined=features)[-1]
         with torch.autocast(defocus.device.type, enabled=False):
             log_ratio = functional.conv2d(x.float(), self.head.weight, self.head.bias)
         log_ratio = log_ratio.clamp(-RATIO_BOUND, RATIO_BOUND)

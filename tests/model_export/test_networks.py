@@ -1,9 +1,12 @@
 """Both pairs of networks, behind one interface."""
 
+import copy
+
 import pytest
 import torch
 
 from model_export.config import Kind, TrainConfig
+from model_export.folded import folded
 from model_export.losses import Batch, correct, run_pair, total_loss
 from model_export.networks import BandEnergy, Surroundings, make_pair, parameter_count
 from model_export.render import blur
@@ -27,6 +30,31 @@ def test_both_pairs_answer_alike(kind: Kind) -> None:
         assert values.shape == cells
         assert torch.isfinite(values).all()
     assert (seen.blur_px > 0).all()
+
+
+def test_folding_changes_no_answer_even_at_the_border() -> None:
+    pair = make_pair("compact")
+    for name, values in pair.modules().state_dict().items():
+        if values.is_floating_point():  # batch norms' too, which start as the identity
+            spread = torch.rand_like(values) * 0.4
+            values.copy_(0.8 + spread if name.endswith("running_var") else values + spread - 0.2)
+    pair.modules().eval().double()
+    other = folded(pair)
+    picture, maps, inputs = (torch.rand(1, c, s, s).double() for c, s in ((3, 64), (12, 32), (32, 32)))
+    for name, given in (("blur", (picture, maps)), ("depth", (inputs,))):
+        with torch.inference_mode():
+            expected, found = (one.modules().get_submodule(f"{name}.unet")(*given) for one in (pair, other))
+        for ours, theirs in zip(found, expected, strict=True):
+            torch.testing.assert_close(ours, theirs)
+
+
+def test_folding_leaves_the_papers_pair_and_the_pair_in_training_alone() -> None:
+    paper, ours = make_pair("paper"), make_pair("compact")
+    before = copy.deepcopy(ours.modules().state_dict())
+    assert folded(paper) is paper
+    assert folded(ours).modules().state_dict().keys() != before.keys()
+    torch.testing.assert_close(ours.modules().state_dict(), before)
+    assert ours.blur.training
 
 
 def test_the_papers_pair_has_its_size() -> None:
