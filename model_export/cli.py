@@ -1,7 +1,9 @@
 """What training adds to the command ``camind``: train, average, export, verify, evaluate, bench, blender."""
 
-from collections.abc import Iterator
+import json
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,7 +17,7 @@ if TYPE_CHECKING:  # importing torch takes seconds; a command that needs it does
     from model_export.verify import Difference
 
 commands = typer.Typer(help="Train, export and score models.")
-bench = typer.Typer(help="Measure accuracy and speed where the truth is known.", no_args_is_help=True)
+bench = typer.Typer(help="Measure speed, or accuracy where the truth is known.", invoke_without_command=True)
 commands.add_typer(bench, name="bench")
 
 Kind = Annotated[str, typer.Option(help="compact (ours) or paper")]
@@ -31,6 +33,15 @@ DEFAULT_MODEL = Path(__file__).parents[1] / "service" / "models"
 def _fail(message: str) -> typer.Exit:
     typer.secho(message, err=True, fg="red")
     return typer.Exit(1)
+
+
+def _print(tables: Iterable[Table]) -> None:
+    """To the terminal at its width, to a file at one that holds them."""
+    stdout = Console()
+    if not stdout.is_terminal:
+        stdout.width = FILE_COLUMNS
+    for table in tables:
+        stdout.print(table)
 
 
 @contextmanager
@@ -49,6 +60,10 @@ def train(
     kind: Kind = "compact",
     steps: Annotated[int, typer.Option(min=1, help="batches in the whole run")] = 12_000,
     seed: Annotated[int, typer.Option(min=0, help="the same seed is the same run")] = 1,
+    weights: Annotated[
+        Path | None, typer.Option(help="checkpoint whose weights a new run begins with", exists=True, dir_okay=False)
+    ] = None,
+    learning_rate: Annotated[float, typer.Option(min=1e-6, max=1e-2, help="before it falls")] = 1e-3,
     workers: Annotated[int, typer.Option(min=0, max=64, help="processes that draw scenes")] = 1,
     device: Annotated[str, typer.Option(help="torch device")] = "cpu",
 ) -> None:
@@ -59,10 +74,12 @@ def train(
 
     if kind not in {"compact", "paper"}:
         raise _fail(f"--kind is compact or paper, not {kind}")
-    config = TrainConfig(kind="paper" if kind == "paper" else "compact", steps=steps, seed=seed)
+    config = replace(
+        TrainConfig(steps=steps, seed=seed, learning_rate=learning_rate), kind="paper" if kind == "paper" else "compact"
+    )
     try:
-        path = run_training(config, textures, run, workers=workers, device=device)
-    except FileNotFoundError as exc:
+        path = run_training(config, textures, run, weights=weights, workers=workers, device=device)
+    except (FileNotFoundError, ValueError) as exc:
         raise _fail(str(exc)) from exc
     typer.echo(path)
 
@@ -143,14 +160,12 @@ def evaluate(
         report = run_evaluation(
             model, sets, lambda said, finished: progress.update(task, description=said, advance=finished)
         )
-    stdout = Console()
-    if not stdout.is_terminal:
-        stdout.width = FILE_COLUMNS
+    tables = []
     for title, (head, rows) in reports.tables(report).items():
-        table = Table(Column(head[0], no_wrap=True), *head[1:], title=title)
+        tables.append(Table(Column(head[0], no_wrap=True), *head[1:], title=title))
         for row in rows:
-            table.add_row(*row)
-        stdout.print(table)
+            tables[-1].add_row(*row)
+    _print(tables)
     if out is not None:
         reports.write(report, out)
         typer.echo(out / "report.html")
@@ -158,6 +173,28 @@ def evaluate(
         from model_export.card import record_scores
 
         record_scores(model, report.scores(), reports.markdown(report), "camind evaluate --data DATA")
+
+
+@bench.callback()
+def speed(
+    context: typer.Context,
+    model: Model = DEFAULT_MODEL,
+    rounds: Annotated[int, typer.Option(min=2, help="times that everything is timed, in turns")] = 10,
+    seconds: Annotated[float, typer.Option(min=1, help="how long each number of clients asks")] = 10.0,
+    out: Annotated[Path | None, typer.Option(help="JSON file to write", dir_okay=False)] = None,
+) -> None:
+    """Time the graphs beside the paper's network, whole requests, and many clients; takes the machine to itself."""
+    if context.invoked_subcommand is not None:
+        return
+    with _training_parts():
+        from model_export import bench_speed
+
+    with progress_bar(Console(stderr=True)) as progress:
+        task = progress.add_task("measuring", total=bench_speed.steps(rounds))
+        report = bench_speed.measure(model, rounds, seconds, lambda: progress.advance(task))
+    _print(bench_speed.tables(report))
+    if out is not None:
+        out.write_text(json.dumps(report.as_dict(), indent=2) + "\n")
 
 
 @bench.command()

@@ -206,6 +206,12 @@ class Trainer:
             self.optimizer.load_state_dict(resume.optimizer)
             self.step = resume.step
 
+    def begin_with(self, other: Checkpoint) -> None:
+        """Take over another run's weights, and nothing else of it."""
+        if other.config.kind != self.config.kind:
+            raise ValueError(f"weights of a {other.config.kind} pair do not fit a {self.config.kind} pair")
+        self.modules.load_state_dict(other.modules)
+
     def autocast(self) -> torch.autocast:
         """bfloat16 where the hardware computes it; emulated on an older processor it is ten times slower."""
         return torch.autocast(self.device.type, torch.bfloat16, enabled=computes_bfloat16(self.device))
@@ -281,17 +287,24 @@ def train(
     textures: Path,
     run: Path,
     *,
+    weights: Path | None = None,
     workers: int = 1,
     device: str = "cpu",
     console: Console | None = None,
 ) -> Path:
-    """Train in folder ``run``, going on from its checkpoint if there is one; the path of the last checkpoint."""
+    """Train in folder ``run``, going on from its checkpoint if there is one; the path of the last checkpoint.
+
+    A run without a checkpoint begins with the weights of the checkpoint ``weights``, or with random ones. Raises
+    ``ValueError`` for weights of another kind.
+    """
     console = console or Console(stderr=True)
     photographs = load_photographs(textures)
     run.mkdir(parents=True, exist_ok=True)
     path = run / "checkpoint.pt"
     resume = Checkpoint.load(path) if path.exists() else None
     trainer = Trainer(config, device, resume)
+    if resume is None and weights is not None:
+        trainer.begin_with(Checkpoint.load(weights))
     pool = Pool(config, photographs, trainer.step, workers)
     test = held_out(config.scenes, photographs, 2 * config.batch)
     with progress_bar(console) as progress:

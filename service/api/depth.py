@@ -169,13 +169,14 @@ def fulfil(cancellation: Cancellation, order: Order, estimator: Estimator) -> An
     for u, v in order.query.points:
         pixel_at(u, v, photograph.width_px, photograph.height_px)
     depth_map = estimator.estimate(photograph.rgb, camera, order.query.side, cancellation)
+    stopwatch.add(depth_map.timings_ms)
     warnings = (*order.warnings, *photograph.warnings, *resized, *depth_map.warnings)
     with stopwatch.stage("encode"):
         if order.format == JSON:
             encoded = _encode_json(depth_map, order, estimator.manifest.name, warnings)
         else:
             encoded = ENCODERS[order.format](depth_map, photograph.rgb)
-    return Answer(encoded, (*warnings, *encoded.warnings), {**stopwatch.elapsed_ms, **depth_map.timings_ms})
+    return Answer(encoded, (*warnings, *encoded.warnings), stopwatch.elapsed_ms)
 
 
 def _encode_json(depth_map: DepthMap, order: Order, model: str, warnings: tuple[str, ...]) -> Encoded:

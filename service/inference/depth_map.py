@@ -15,7 +15,6 @@ from service.optics.camera import Camera
 MAX_RELATIVE_ERROR = 1.0
 SIGMA_OF_LAPLACE = np.float32(2**0.5)
 ROWS_AT_ONCE = 128
-DECIDED_FROM = ("blur_px", "log_ratio_near", "log_ratio_far", "p_near", "log_scale")
 
 Array = NDArray[np.float32]
 
@@ -55,11 +54,18 @@ class DepthMap:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """Raw maps of one copy of the photograph, with the camera at that copy's size."""
+    """Raw maps of one copy of the photograph, with the camera at that copy's size, and what they say at their cells.
+
+    ``near_m`` and ``far_m`` are both hypotheses, the far one NaN where there is none, and ``error`` that of depth,
+    relative.
+    """
 
     maps: RawMaps
     camera: Camera
     scale: float
+    near_m: Array
+    far_m: Array
+    error: Array
     rows: Axis
     columns: Axis
 
@@ -68,10 +74,15 @@ class Reading:
         """``photograph_size`` is (height, width)."""
         height, width = photograph_size
         map_rows, map_columns = maps["blur_px"].shape
+        x = thin_lens.relative_defocus_from_blur(maps["blur_px"], camera.gamma_px, camera.k_cam_px)
+        focus_m = np.float32(camera.focus_distance_m)
         return cls(
             maps,
             camera,
             camera.image_width_px / width,
+            np.exp(maps["log_ratio_near"]) * focus_m,
+            np.where(x < 1, np.exp(maps["log_ratio_far"]) * focus_m, np.float32(np.nan)),
+            np.exp(maps["log_scale"]) * SIGMA_OF_LAPLACE,
             Axis.between(height, camera.image_height_px, stride, map_rows),
             Axis.between(width, camera.image_width_px, stride, map_columns),
         )
@@ -91,14 +102,23 @@ class Layers:
     def empty(cls, height: int, width: int) -> Self:
         return cls(*(np.empty((height, width), np.float32) for _ in cls.__slots__))
 
-    def put(self, start: int, stop: int, other: "Layers", where: NDArray[np.bool_] | None = None) -> None:
-        """Copy rows ``start:stop`` from layers of that height, everywhere or where told."""
+    def rows(self, start: int, stop: int) -> "Layers":
+        """Views of some rows."""
+        return Layers(*(getattr(self, name)[start:stop] for name in self.__slots__))
+
+    def take(self, other: "Layers", where: NDArray[np.bool_] | None = None) -> None:
+        """Copy layers of the same size, everywhere or where told."""
         for name in self.__slots__:
-            np.copyto(
-                getattr(self, name)[start:stop],
-                getattr(other, name),
-                where=True if where is None else where,
-            )
+            np.copyto(getattr(self, name), getattr(other, name), where=True if where is None else where)
+
+    def hide_unanswered(self) -> NDArray[np.bool_]:
+        """Which pixels have an answer; NaN goes where there is none."""
+        with np.errstate(invalid="ignore"):
+            valid = (self.sigma_m <= MAX_RELATIVE_ERROR * self.depth_m) & np.isfinite(self.depth_m)
+        if not valid.all():
+            for hidden in (self.depth_m, self.depth_alt_m, self.sigma_m):
+                hidden[~valid] = np.nan
+        return valid
 
 
 def decide(readings: list[Reading], size: tuple[int, int], side: Side) -> tuple[Layers, NDArray[np.bool_]]:
@@ -107,36 +127,28 @@ def decide(readings: list[Reading], size: tuple[int, int], side: Side) -> tuple[
     Rows are done in bands: a photograph of 12 megapixels would need a gigabyte at once.
     """
     height, width = size
-    layers = Layers.empty(height, width)
+    layers, valid = Layers.empty(height, width), np.empty((height, width), np.bool_)
     for start in range(0, height, ROWS_AT_ONCE):
         stop = min(start + ROWS_AT_ONCE, height)
-        best: Array | None = None
+        band, best = layers.rows(start, stop), None
         for reading in readings:
-            band, error = _band(reading, start, stop, side)
-            where = None if best is None else error < best
-            layers.put(start, stop, band, where)
+            told, error = _band(reading, start, stop, side)
+            band.take(told, None if best is None else error < best)
             best = error if best is None else np.fmin(best, error)
-    with np.errstate(invalid="ignore"):
-        valid = (layers.sigma_m <= MAX_RELATIVE_ERROR * layers.depth_m) & np.isfinite(layers.depth_m)
-    for hidden in (layers.depth_m, layers.depth_alt_m, layers.sigma_m):
-        hidden[~valid] = np.nan
+        valid[start:stop] = band.hide_unanswered()
     return layers, valid
 
 
 def _band(reading: Reading, start: int, stop: int, side: Side) -> tuple[Layers, Array]:
     """Layers of some rows from one reading, and the relative error of depth there."""
-    rows = reading.rows.part(start, stop)
-    at = {name: sample(reading.maps[name], rows, reading.columns) for name in DECIDED_FROM}
-    camera = reading.camera
-    x = thin_lens.relative_defocus_from_blur(at["blur_px"], camera.gamma_px, camera.k_cam_px)
-    has_far = x < 1
-    near_m = np.exp(at["log_ratio_near"]) * camera.focus_distance_m
-    far_m = np.where(has_far, np.exp(at["log_ratio_far"]) * camera.focus_distance_m, np.float32(np.nan))
-    p_near = _p_near(at["p_near"], has_far, side)
+    rows, columns = reading.rows.part(start, stop), reading.columns
+    near_m, far_m = sample(reading.near_m, rows, columns), sample(reading.far_m, rows, columns)
+    error = sample(reading.error, rows, columns)
+    p_near = _p_near(sample(reading.maps["p_near"], rows, columns), np.isfinite(far_m), side)
     is_near = p_near >= 0.5
     depth_m = np.where(is_near, near_m, far_m)
-    error = np.exp(at["log_scale"]) * SIGMA_OF_LAPLACE
-    blur_px = at["blur_px"] / np.float32(reading.scale)
+    blur_px = sample(reading.maps["blur_px"], rows, columns)
+    blur_px /= np.float32(reading.scale)
     return Layers(depth_m, np.where(is_near, far_m, near_m), p_near, error * depth_m, blur_px), error
 
 

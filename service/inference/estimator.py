@@ -18,6 +18,7 @@ HIGH_BLUR_FRACTION = 0.02
 SECOND_SCALE = 1 / 3
 LEAST_CHANGE_OF_SCALE = 0.7
 FEW_ANSWERS = 0.5
+KEPT_MEMORY_PX = 600_000
 WARM_UP_PX = 64
 
 
@@ -63,8 +64,10 @@ class Estimator:
         second = self._second_scale(readings[0])
         if second is not None:
             readings.append(self._read(rgb, camera, second, side, cancellation, stopwatch))
+        if height * width > KEPT_MEMORY_PX:
+            self._pair.free_memory()
         cancellation.check()
-        with stopwatch.stage("depth"):
+        with stopwatch.stage("encode"):
             layers, valid = decide(readings, (height, width), side)
         return DepthMap(
             **{name: getattr(layers, name) for name in Layers.__slots__},

@@ -5,7 +5,7 @@ distance, nothing decided yet.
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Literal
@@ -40,7 +40,10 @@ class Stopwatch:
         try:
             yield
         finally:
-            spent = (time.perf_counter() - started) * 1e3
+            self.add({name: (time.perf_counter() - started) * 1e3})
+
+    def add(self, elapsed_ms: Mapping[str, float]) -> None:
+        for name, spent in elapsed_ms.items():
             self.elapsed_ms[name] = self.elapsed_ms.get(name, 0.0) + spent
 
 
@@ -73,6 +76,13 @@ class GraphPair:
             told = self._depth.run(feeds, cancellation)
         rows, columns = (-(-size // self.manifest.stride) for size in rgb.shape[:2])
         return {name: (seen | told)[name][0, 0, :rows, :columns] for name in MAPS}
+
+    def free_memory(self) -> None:
+        """Give back what large pictures have taken, through a run on a tiny one."""
+        tiny = np.zeros((self.manifest.multiple, self.manifest.multiple, 3), np.uint8)
+        seen = self._blur.run({"image": self._padded(tiny)}, Cancellation(), free_memory=True)
+        camera = Camera(tiny.shape[1], tiny.shape[0], 1.0, 1.0)
+        self._depth.run(_corrected(seen, camera, "auto"), Cancellation(), free_memory=True)
 
     def see(self, rgb: NDArray[np.uint8], cancellation: Cancellation) -> RawMaps:
         """What the blur graph says of an image: the same for every camera."""

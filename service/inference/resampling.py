@@ -33,8 +33,16 @@ def sample(values: NDArray[np.float32], rows: Axis, columns: Axis) -> NDArray[np
     """The map [h, w] at every crossing of the axes: float32 [len(rows), len(columns)]."""
     first = int(rows.before[0])
     band = values[first : int(rows.after[-1]) + 1]
-    # np.take along the last axis first: the band has fewer rows than the photograph
-    left = band.take(columns.before, axis=1)
-    band = left + (band.take(columns.after, axis=1) - left) * columns.share
-    upper = band[rows.before - first]
-    return upper + (band[rows.after - first] - upper) * rows.share[:, np.newaxis]
+    # along the last axis first: the band has fewer rows than the photograph
+    wide = _between(band.take(columns.before, axis=1), band.take(columns.after, axis=1), columns.share)
+    return _between(wide[rows.before - first], wide[rows.after - first], rows.share[:, np.newaxis])
+
+
+def _between(
+    before: NDArray[np.float32], after: NDArray[np.float32], share: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """``before`` moved by ``share`` towards ``after``, in place of both."""
+    after -= before
+    after *= share
+    before += after
+    return before

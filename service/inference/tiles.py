@@ -1,13 +1,12 @@
 """Large photographs in overlapping tiles, so that memory follows the tile and not the photograph."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-PIXEL_BUDGET = 1_500_000
+PIXEL_BUDGET = 2_300_000
 OVERLAP_PX = 128
 
 Maps = dict[str, NDArray[np.float32]]
@@ -37,8 +36,7 @@ def read_in_tiles(
     height, width = rgb.shape[:2]
     if height * width <= pixel_budget:
         return read(rgb)
-    side = max(math.isqrt(pixel_budget) // multiple * multiple, 2 * OVERLAP_PX + multiple)
-    rows, columns = spans(height, side, multiple), spans(width, side, multiple)
+    rows, columns = layout(height, width, multiple, pixel_budget)
     merged = _Merge(-(-height // stride), -(-width // stride))
     for row, fade_row in zip(rows, fades(rows, stride), strict=True):
         for column, fade_column in zip(columns, fades(columns, stride), strict=True):
@@ -47,13 +45,35 @@ def read_in_tiles(
     return merged.maps
 
 
-def spans(size: int, side: int, multiple: int) -> list[Span]:
-    """Spans of about ``side`` that cover ``size`` evenly and overlap by ``OVERLAP_PX`` or more."""
-    if size <= side:
-        return [Span(0, size)]
-    count = math.ceil((size - OVERLAP_PX) / (side - OVERLAP_PX - multiple))
-    step = (size - side) / (count - 1)
-    starts = [int(place * step) // multiple * multiple for place in range(count)]
+def layout(height: int, width: int, multiple: int, pixel_budget: int) -> tuple[list[Span], list[Span]]:
+    """Rows and columns of tiles of at most ``pixel_budget``, so that the least is read twice.
+
+    No tile is narrower than two overlaps, whatever the budget.
+    """
+    least = 2 * OVERLAP_PX + multiple
+    best: tuple[int, int, int] | None = None
+    for across in range(1, max(1, width // least) + 1):
+        for down in range(1, max(1, height // least) + 1):
+            tile = _side(height, down, multiple) * _side(width, across, multiple)
+            if tile <= pixel_budget and (best is None or tile * down * across < best[0]):
+                best = (tile * down * across, down, across)
+    _, down, across = best or (0, max(1, height // least), max(1, width // least))
+    return spans(height, down, multiple), spans(width, across, multiple)
+
+
+def _side(size: int, count: int, multiple: int) -> int:
+    """What ``count`` spans must measure to cover ``size`` and overlap, wherever starts are moved to multiples."""
+    if count == 1:
+        return size
+    return -(-(size + (count - 1) * (OVERLAP_PX + multiple)) // (count * multiple)) * multiple
+
+
+def spans(size: int, count: int, multiple: int) -> list[Span]:
+    """So many even spans that cover ``size`` and overlap by ``OVERLAP_PX`` or more, each from a multiple."""
+    side = _side(size, count, multiple)
+    starts = (
+        [(size - side) * place // (count - 1) // multiple * multiple for place in range(count)] if count > 1 else [0]
+    )
     return [Span(start, min(start + side, size)) for start in starts[:-1]] + [Span(starts[-1], size)]
 
 

@@ -184,5 +184,5 @@ def test_a_run_inside_the_graph_stops_when_asked(folder: Path) -> None:
 
 def test_the_stages_are_timed(estimator: Estimator) -> None:
     timings = estimator.estimate(grey(60), CAMERA).timings_ms
-    assert set(timings) == {"blur", "correct", "depth"}
+    assert set(timings) == {"blur", "correct", "depth", "encode"}
     assert all(spent > 0 for spent in timings.values())

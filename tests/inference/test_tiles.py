@@ -12,26 +12,29 @@ from numpy.typing import NDArray
 from service.inference.artifact import load_model_folder
 from service.inference.estimator import Estimator
 from service.inference.pair import GraphPair
-from service.inference.tiles import OVERLAP_PX, fades, read_in_tiles, spans
+from service.inference.tiles import OVERLAP_PX, PIXEL_BUDGET, fades, read_in_tiles, spans
 from service.opencv import cv2
 from service.optics.camera import Camera
 from tests.inference.oracle_pair import build_oracle_pair
 
 
-@given(size=st.integers(300, 9000), side=st.integers(18, 80).map(lambda n: n * 16))
-def test_spans_cover_everything_and_overlap_enough(size: int, side: int) -> None:
-    found = spans(size, max(side, 2 * OVERLAP_PX + 16), 16)
+@given(size=st.integers(300, 9000), count=st.integers(1, 12))
+def test_spans_cover_everything_and_overlap_enough(size: int, count: int) -> None:
+    count = min(count, max(1, size // (2 * OVERLAP_PX + 16)))
+    found = spans(size, count, 16)
+    assert len(found) == count
     assert found[0].start == 0
     assert found[-1].stop == size
     for one, following in pairwise(found):
         assert following.start % 16 == 0
         assert one.stop - following.start >= OVERLAP_PX
-    assert max(span.stop - span.start for span in found) <= max(side, 2 * OVERLAP_PX + 16) + 16
+    sizes = [span.stop - span.start for span in found]
+    assert max(sizes) - min(sizes) <= 16 * len(found)
 
 
 @given(size=st.integers(300, 5000), stride=st.sampled_from([1, 2, 4]))
 def test_weights_sum_to_one_at_every_pixel(size: int, stride: int) -> None:
-    found = spans(size, 512, 16)
+    found = spans(size, max(1, size // 400), 16)
     total = np.zeros(-(-size // stride))
     for span, weight in zip(found, fades(found, stride), strict=True):
         assert (weight >= 0).all()
@@ -64,8 +67,12 @@ def test_tiled_equals_untiled(pair: GraphPair, height: int, width: int) -> None:
     camera = Camera(width, height, 2.0, 6.0, 0.5)
     whole = Estimator(pair, pixel_budget=10**9).estimate(rgb, camera)
     tiled = Estimator(pair, pixel_budget=200_000).estimate(rgb, camera)
+    decided = np.abs(whole.p_near - 0.5) > 1e-3
+    assert decided.mean() > 0.98
     for name in ("depth_m", "depth_alt_m", "p_near", "sigma_m", "blur_px"):
-        np.testing.assert_allclose(getattr(tiled, name), getattr(whole, name), rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(
+            getattr(tiled, name)[decided], getattr(whole, name)[decided], rtol=1e-4, atol=1e-5, err_msg=name
+        )
 
 
 def test_a_tile_is_never_much_larger_than_the_budget() -> None:
@@ -78,7 +85,7 @@ def test_a_tile_is_never_much_larger_than_the_budget() -> None:
     rgb: NDArray[np.uint8] = np.broadcast_to(np.zeros(3, np.uint8), (3072, 4080, 3))
     merged = read_in_tiles(rgb, read, multiple=16, stride=2)
     assert merged["level"].shape == (1536, 2040)
-    assert max(sizes) <= 1_600_000
+    assert max(sizes) <= PIXEL_BUDGET
 
 
 def test_a_model_folder_path_with_a_stride_of_one_is_read_alike(tmp_path: Path) -> None:

@@ -66,6 +66,16 @@ def test_the_mean_of_two_checkpoints_lies_between_them(textures: Path, tmp_path:
         first.averaged(replace(second, config=replace(CONFIG, kind="paper")))
 
 
+def test_a_new_run_begins_with_the_weights_it_is_told(textures: Path, tmp_path: Path) -> None:
+    first, _ = run(CONFIG, textures, tmp_path / "first")
+    trainer = Trainer(replace(CONFIG, seed=2), "cpu")
+    trainer.begin_with(first)
+    assert trainer.step == 0
+    torch.testing.assert_close(trainer.modules.state_dict(), first.modules)
+    with pytest.raises(ValueError, match="do not fit"):
+        Trainer(replace(CONFIG, kind="paper"), "cpu").begin_with(first)
+
+
 def test_a_stopped_run_goes_on_as_if_it_had_not_been_stopped(textures: Path, tmp_path: Path) -> None:
     whole, _ = run(CONFIG, textures, tmp_path / "whole")
     (tmp_path / "stopped").mkdir()

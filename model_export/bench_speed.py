@@ -1,0 +1,146 @@
+"""``camind bench``: graphs, service and machine measured in one run, as tables and as JSON."""
+
+import platform
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import onnxruntime
+import torch
+from rich.table import Table
+
+from model_export import bench_graphs, bench_service
+from model_export.bench_graphs import SIZE, THREADS, NetworkRow, Rate, SizeRow, Timing
+from model_export.bench_service import LoadRow, RequestRow
+from service.inference.artifact import load_model_folder
+
+LARGE_ROUNDS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedReport:
+    """Everything one run measured. ``gigaflops`` is what both graphs compute for a 640x480 picture."""
+
+    model: str
+    machine: dict[str, str]
+    gigaflops: dict[str, float]
+    networks: list[NetworkRow]
+    rates: list[Rate]
+    sizes: list[SizeRow]
+    requests: list[RequestRow]
+    load: list[LoadRow]
+    peak_memory_mb: dict[str, float]
+
+    def as_dict(self) -> dict[str, object]:
+        return asdict(self)
+
+    def share_of_machine(self, row: NetworkRow) -> float:
+        """What the graphs compute in a second over the best float32 rate of any library on as many threads."""
+        best = max(r.giga_per_second for r in self.rates if r.numbers == "float32" and r.threads == row.threads)
+        return self.gigaflops[row.network] / row.timing.median_s / best
+
+
+def measure(model: Path, rounds: int, seconds: float, on_step: Callable[[], None]) -> SpeedReport:
+    """Measure everything; each number of clients asks for ``seconds``. ``on_step`` is called ``steps`` times."""
+    manifest = load_model_folder(model).manifest
+    with tempfile.TemporaryDirectory() as scratch:
+        networks = bench_graphs.time_networks(model, Path(scratch), rounds, on_step)
+    rates = [rate for threads in THREADS for rate in bench_graphs.machine_rates(threads, LARGE_ROUNDS, on_step)]
+    sizes = bench_graphs.time_sizes(model, LARGE_ROUNDS, on_step)
+    memory = {}
+    with bench_service.serving(model) as service:
+        frame = bench_service.time_frames(service, rounds, on_step)
+        memory["640x480 frames"] = service.memory_mb("VmHWM")
+        load = bench_service.time_load(service, seconds, on_step)
+        memory["many clients"] = service.memory_mb("VmHWM")
+        large = bench_service.time_photographs(service, LARGE_ROUNDS, on_step)
+        memory["12-megapixel photographs"] = service.memory_mb("VmHWM")
+    return SpeedReport(
+        model=manifest.name,
+        machine={
+            "processor": platform.processor() or platform.machine(),
+            "float32 path": torch.backends.cpu.get_cpu_capability(),
+            "torch": torch.__version__,
+            "onnxruntime": onnxruntime.__version__,
+        },
+        gigaflops={kind: bench_graphs.graph_flops(kind, *SIZE) / 1e9 for kind in ("paper", manifest.kind)},
+        networks=networks,
+        rates=rates,
+        sizes=sizes,
+        requests=[frame, *large],
+        load=load,
+        peak_memory_mb=memory,
+    )
+
+
+def steps(rounds: int) -> int:
+    """How often ``measure`` tells of progress."""
+    graphs = len(THREADS) * (rounds + 1) + (len(THREADS) + 1) * (LARGE_ROUNDS + 1)
+    return graphs + 1 + len(bench_service.CLIENTS) + len(bench_service.PHOTOGRAPHS_K_CAM_PX)
+
+
+def tables(report: SpeedReport) -> list[Table]:
+    """The report for a terminal."""
+    return [
+        _networks(report),
+        _rates(report),
+        _sizes(report),
+        _requests(report),
+        _load(report),
+    ]
+
+
+def _ms(timing: Timing) -> str:
+    return f"{1e3 * timing.median_s:,.1f} ± {100 * timing.spread:.0f} %"
+
+
+def _networks(report: SpeedReport) -> Table:
+    head = (
+        "640x480",
+        "threads",
+        "ms",
+        "times paper, PyTorch",
+        "times paper, ONNX Runtime",
+        "of the machine's best float32",
+    )
+    table = Table(*head, title="Networks")
+    for row in report.networks:
+        ratios = (f"{row.faster_than_eager:.1f}", f"{row.faster_than_runtime:.1f}")
+        table.add_row(row.name, str(row.threads), _ms(row.timing), *ratios, f"{report.share_of_machine(row):.0%}")
+    return table
+
+
+def _rates(report: SpeedReport) -> Table:
+    table = Table("library", "numbers", "threads", "1e9 operations a second", title="What the machine can do")
+    for rate in report.rates:
+        table.add_row(rate.name, rate.numbers, str(rate.threads), f"{rate.giga_per_second:,.0f}")
+    return table
+
+
+def _sizes(report: SpeedReport) -> Table:
+    table = Table("size", "ms", "cost of a pixel", title=f"Sizes, read at full size, {THREADS[-1]} threads")
+    for row in report.sizes:
+        table.add_row(f"{row.width_px}x{row.height_px}", _ms(row.timing), f"{row.cost_of_a_pixel:.2f}")
+    return table
+
+
+def _requests(report: SpeedReport) -> Table:
+    stages = list(report.requests[0].stages_ms)
+    table = Table("JPEG to 16-bit PNG", "ms", *stages, "all but the graphs", title="Requests over HTTP")
+    for row in report.requests:
+        told = [f"{row.stages_ms[stage]:,.1f}" for stage in stages]
+        table.add_row(row.name, _ms(row.timing), *told, f"{row.around_graphs_ms:,.1f}")
+    for what, megabytes in report.peak_memory_mb.items():
+        table.add_row(f"peak memory after {what}", f"{megabytes:,.0f} MB")
+    return table
+
+
+def _load(report: SpeedReport) -> Table:
+    head = ("clients", "answered", "503", "failed", "per second", "p50 s", "p95 s", "p99 s", "memory MB")
+    table = Table(*head, title="Many clients, 640x480")
+    for row in report.load:
+        counts = (str(n) for n in (row.clients, row.answered, row.refused, row.failed))
+        times = (f"{s:.2f}" for s in row.percentiles_s.values())
+        table.add_row(*counts, f"{row.per_second:.2f}", *times, f"{row.memory_mb:,.0f}")
+    return table
