@@ -32,6 +32,7 @@ from service.inference.frame import camera_of
 from service.inference.images import MEDIA_TYPES as IMAGE_TYPES
 from service.inference.images import ImageLimits, read_photograph
 from service.inference.pair import Stopwatch
+from service.inference.part import Part
 from service.optics.camera import Camera
 from service.storage.cameras import CameraRecord
 
@@ -76,7 +77,7 @@ router = APIRouter(tags=["depth"])
     responses={
         200: {
             "model": DepthRead,
-            "description": "The depth map, of the size of the upright photograph",
+            "description": "The depth map, of the size of the upright photograph or of the part asked for",
             "content": {
                 media_type: {"schema": {"type": "string", "format": "binary"}} for media_type in MEDIA_TYPES.values()
             },
@@ -131,7 +132,8 @@ async def estimate_depth(
 ) -> Response:
     """Depth along the optical axis for every pixel, from the blur of one photograph and its camera.
 
-    The photograph must be the camera's whole frame, at any size. Without an answer a pixel is NaN, in png 0.
+    The photograph must be the camera's whole frame, at any size; a part of the map alone is `roi`. Without an answer a
+    pixel is NaN, in png 0.
     """
     chosen = choose_format(query.format, request.headers.get("accept"), FORMAT_TYPES)
     upload = await receive_photograph(request, settings.max_image_bytes)
@@ -166,20 +168,22 @@ def fulfil(cancellation: Cancellation, order: Order, estimator: Estimator) -> An
     with stopwatch.stage("decode"):
         photograph = read_photograph(order.upload.data, order.upload.media_type, order.limits)
     camera, resized = camera_of(photograph, order.camera)
+    part = order.query.part or Part(0, 0, photograph.width_px, photograph.height_px)
+    part.require_within(photograph.width_px, photograph.height_px)
     for u, v in order.query.points:
-        pixel_at(u, v, photograph.width_px, photograph.height_px)
-    depth_map = estimator.estimate(photograph.rgb, camera, order.query.side, cancellation)
+        pixel_at(u, v, part)
+    depth_map = estimator.estimate(photograph.rgb, camera, order.query.side, cancellation, order.query.part)
     stopwatch.add(depth_map.timings_ms)
     warnings = (*order.warnings, *photograph.warnings, *resized, *depth_map.warnings)
     with stopwatch.stage("encode"):
         if order.format == JSON:
-            encoded = _encode_json(depth_map, order, estimator.manifest.name, warnings)
+            encoded = _encode_json(depth_map, order, part, estimator.manifest.name, warnings)
         else:
-            encoded = ENCODERS[order.format](depth_map, photograph.rgb)
+            encoded = ENCODERS[order.format](depth_map, part.of(photograph.rgb))
     return Answer(encoded, (*warnings, *encoded.warnings), stopwatch.elapsed_ms)
 
 
-def _encode_json(depth_map: DepthMap, order: Order, model: str, warnings: tuple[str, ...]) -> Encoded:
+def _encode_json(depth_map: DepthMap, order: Order, part: Part, model: str, warnings: tuple[str, ...]) -> Encoded:
     read = DepthRead(
         camera=order.record.name,
         revision=order.record.revision,
@@ -188,7 +192,7 @@ def _encode_json(depth_map: DepthMap, order: Order, model: str, warnings: tuple[
         height_px=depth_map.height_px,
         depth_m=SpreadRead.model_validate(spread_of(depth_map)),
         valid_fraction=depth_map.valid_fraction,
-        points=[PointRead.model_validate(read_point(depth_map, u, v)) for u, v in order.query.points],
+        points=[PointRead.model_validate(read_point(depth_map, u, v, part)) for u, v in order.query.points],
         warnings=list(warnings),
     )
     return Encoded(read.model_dump_json().encode(), FORMAT_TYPES[JSON])

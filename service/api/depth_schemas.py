@@ -6,7 +6,9 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from service.inference.pair import Side
+from service.inference.part import Part
 
+ROI = r"^\d{1,6},\d{1,6},\d{1,6},\d{1,6}$"
 MAX_POINTS = 1000
 POINT = re.compile(r"(-?\d{1,6}(?:\.\d{1,6})?),(-?\d{1,6}(?:\.\d{1,6})?)")
 
@@ -37,6 +39,13 @@ class DepthQuery(BaseModel):
         tuple[Point, ...],
         Field(max_length=MAX_POINTS, description="Pixels u,v to read, repeatable; answered in json"),
     ] = ()
+    roi: Annotated[
+        str | None,
+        Field(
+            pattern=ROI,
+            description="Part u0,v0,u1,v1 of the upright photograph to answer alone; u1 and v1 lie outside it",
+        ),
+    ] = None
     focus_distance_m: Annotated[
         float | None,
         Field(gt=0, allow_inf_nan=False, description="This shot's focus distance, if not the camera's"),
@@ -46,6 +55,11 @@ class DepthQuery(BaseModel):
     def points(self) -> list[tuple[float, float]]:
         """The pixels asked for, (u, v)."""
         return [(_number(u), _number(v)) for u, v in (text.split(",") for text in self.at)]
+
+    @property
+    def part(self) -> Part | None:
+        """The part asked for; None for all of the photograph."""
+        return Part(*map(int, self.roi.split(","))) if self.roi is not None else None
 
 
 class SpreadRead(BaseModel):

@@ -1,13 +1,14 @@
 """The answer to one photograph, and how raw maps become it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Self
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.inference.pair import RawMaps, Side
+from service.inference.part import Part
 from service.inference.resampling import Axis, sample
 from service.optics import thin_lens
 from service.optics.camera import Camera
@@ -46,6 +47,12 @@ class DepthMap:
     @property
     def height_px(self) -> int:
         return int(self.depth_m.shape[0])
+
+    def cut(self, part: Part) -> "DepthMap":
+        """The maps of a part alone, with the camera behind it."""
+        maps: dict[str, Any] = {name: part.of(getattr(self, name)) for name in (*Layers.__slots__, "valid")}
+        size = (part.right - part.left, part.bottom - part.top)
+        return replace(self, **maps, camera=self.camera.cropped(part.left, part.top, *size))
 
     @property
     def valid_fraction(self) -> float:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from service.errors import BadRequest, FieldProblem
 from service.inference.depth_map import DepthMap
+from service.inference.part import Part
 from service.inference.preview import render_preview
 from service.opencv import cv2
 
@@ -159,9 +160,12 @@ def spread_of(answer: DepthMap) -> Spread:
     return Spread(*(float(value) for value in np.percentile(known, PERCENTILES)))
 
 
-def read_point(answer: DepthMap, u: float, v: float) -> PointReading:
-    """The maps at the pixel whose area holds (u, v); raises ``BadRequest`` outside the photograph."""
-    row, column = pixel_at(u, v, answer.width_px, answer.height_px)
+def read_point(answer: DepthMap, u: float, v: float, part: Part | None = None) -> PointReading:
+    """The answer at the photograph's pixel whose area holds (u, v); raises ``BadRequest`` outside.
+
+    The answer is to all of the photograph, or to a ``part`` of it.
+    """
+    row, column = pixel_at(u, v, part or Part(0, 0, answer.width_px, answer.height_px))
     return PointReading(
         u,
         v,
@@ -172,14 +176,16 @@ def read_point(answer: DepthMap, u: float, v: float) -> PointReading:
     )
 
 
-def pixel_at(u: float, v: float, width_px: int, height_px: int) -> tuple[int, int]:
-    """Row and column of the pixel whose area holds (u, v).
+def pixel_at(u: float, v: float, part: Part) -> tuple[int, int]:
+    """Row and column, in a part of the photograph, of the pixel whose area holds (u, v).
 
-    Raises ``BadRequest`` outside [-0.5, width - 0.5) x [-0.5, height - 0.5).
+    Raises ``BadRequest`` outside [left - 0.5, right - 0.5) x [top - 0.5, bottom - 0.5).
     """
-    row, column = math.floor(v + 0.5), math.floor(u + 0.5)
+    row, column = math.floor(v + 0.5) - part.top, math.floor(u + 0.5) - part.left
+    width_px, height_px = part.right - part.left, part.bottom - part.top
     if not (0 <= row < height_px and 0 <= column < width_px):
-        detail = f"({u:g}, {v:g}) lies outside the upright photograph of {width_px}x{height_px} pixels."
+        of = f" from ({part.left}, {part.top})" if part.left or part.top else ""
+        detail = f"({u:g}, {v:g}) lies outside the upright photograph of {width_px}x{height_px} pixels{of}."
         raise BadRequest(detail, errors=(FieldProblem("at", detail),))
     return row, column
 

@@ -9,7 +9,8 @@ from service.inference.artifact import Interval, Manifest, ModelFolder
 from service.inference.cancellation import Cancellation
 from service.inference.depth_map import DepthMap, Layers, Reading, decide
 from service.inference.pair import GraphPair, Side, Stopwatch
-from service.inference.tiles import PIXEL_BUDGET, read_in_tiles
+from service.inference.part import Part
+from service.inference.tiles import OVERLAP_PX, PIXEL_BUDGET, read_in_tiles
 from service.opencv import cv2
 from service.optics.camera import Camera
 
@@ -50,15 +51,22 @@ class Estimator:
         camera: Camera,
         side: Side = "auto",
         cancellation: Cancellation | None = None,
+        part: Part | None = None,
     ) -> DepthMap:
         """Depth of an upright photograph, uint8 [h, w, 3] sRGB, whose camera is at exactly that size.
 
-        Raises ``ValueError`` for a camera of another size and ``Cancelled`` when asked to stop.
+        Of a ``part`` alone it costs what the part and its surroundings cost. Raises ``ValueError`` for a camera of
+        another size and ``Cancelled`` when asked to stop.
         """
         height, width = rgb.shape[:2]
         if (width, height) != (camera.image_width_px, camera.image_height_px):
             raise ValueError(f"the camera must be that of a {width}x{height} image: resize it first")
         cancellation = cancellation or Cancellation()
+        if part is not None:
+            margin_px = round(OVERLAP_PX / self._base_scale(camera))
+            around = part.widened(margin_px, self.manifest.multiple, width, height)
+            seen_by = camera.cropped(around.left, around.top, around.right - around.left, around.bottom - around.top)
+            return self.estimate(around.of(rgb), seen_by, side, cancellation).cut(part.within(around))
         stopwatch = Stopwatch()
         readings = [self._read(rgb, camera, self._base_scale(camera), side, cancellation, stopwatch)]
         second = self._second_scale(readings[0])

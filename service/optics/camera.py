@@ -135,6 +135,12 @@ class Camera:
             intrinsics=scaled,
         )
 
+    def cropped(self, left_px: int, top_px: int, width_px: int, height_px: int) -> "Camera":
+        """The camera behind a part of its picture: only the principal point moves."""
+        known = self.intrinsics
+        moved = known and replace(known, cx_px=known.cx_px - left_px, cy_px=known.cy_px - top_px)
+        return replace(self, image_width_px=width_px, image_height_px=height_px, intrinsics=moved)
+
     def turned(self, transposed: bool, flip_u: bool, flip_v: bool) -> "Camera":
         """The camera behind the same picture transposed, then flipped along u, then along v; k_cam stays."""
         size_px = (self.image_width_px, self.image_height_px)

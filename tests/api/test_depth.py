@@ -247,6 +247,8 @@ def test_a_lens_moves_focus_exactly_but_not_nearer_than_its_focal_length(
         ({"at": "nan,1"}, "u,v"),
         ({"at": "96,3", "format": "json"}, "96x64"),
         ({"at": "3,-1", "format": "json"}, "96x64"),
+        ({"roi": "1,2,3"}, "roi"),
+        ({"roi": "-1,2,3,4"}, "roi"),
         ({"colour": "red"}, "colour"),
     ],
 )
@@ -300,6 +302,31 @@ def test_a_form_without_exactly_the_field_is_422(bench: TestClient, form: dict[s
 def test_a_form_of_the_wrong_kind_or_without_bytes_is_refused(bench: TestClient) -> None:
     refused(bench.post("/depth?camera=bench", files={"image": ("a.txt", b"x", "text/plain")}), 415)
     refused(bench.post("/depth?camera=bench", files={"image": ("a.png", b"", "image/png")}), 422, "empty")
+
+
+def test_a_part_is_the_same_part_of_the_whole_in_every_form(bench: TestClient) -> None:
+    body = png(np.random.default_rng(0).integers(40, 130, (64, 96, 3), np.uint8))
+    whole, part = npy(ask(bench, body, format="npy")), npy(ask(bench, body, format="npy", roi="10,20,41,50"))
+    np.testing.assert_allclose(part, whole[20:50, 10:41], rtol=1e-5)
+    with np.load(io.BytesIO(ask(bench, body, format="npz", roi="10,20,41,50").content)) as stored:
+        np.testing.assert_array_equal(stored["K"], [[300, 0, 30], [0, 300, 10], [0, 0, 1]])
+        assert stored["valid"].shape == (30, 31)
+    assert b"element vertex 930\n" in ask(bench, body, format="ply", roi="10,20,41,50").content
+    told = ask(bench, body, format="json", roi="10,20,41,50", at="12,21").json()
+    assert (told["width_px"], told["height_px"]) == (31, 30)
+    (point,) = told["points"]
+    assert (point["u"], point["v"]) == (12, 21)
+    assert point["depth_m"] == pytest.approx(float(whole[21, 12]), rel=1e-5)
+
+
+@pytest.mark.parametrize("roi", ["10,20,10,50", "50,20,40,30", "0,0,97,64", "0,0,96,65"])
+def test_what_is_no_part_of_the_photograph_is_refused_by_name(bench: TestClient, roi: str) -> None:
+    problem = refused(ask(bench, roi=roi), 422, "96x64")
+    assert problem["errors"][0]["pointer"].endswith("roi")
+
+
+def test_a_point_outside_the_part_is_refused(bench: TestClient) -> None:
+    refused(ask(bench, format="json", roi="10,20,41,50", at="9,21"), 422, "(9, 21)", "31x30", "(10, 20)")
 
 
 def test_no_room_is_503_with_retry_after(settings: Settings, app: FastAPI) -> None:
@@ -368,5 +395,5 @@ def test_the_document_lists_every_form_and_every_kind(client: TestClient) -> Non
     assert {"image/jpeg", "image/png", "multipart/form-data"} <= set(operation["requestBody"]["content"])
     assert {"404", "406", "413", "415", "422", "503"} <= set(operation["responses"])
     assert {parameter["name"] for parameter in operation["parameters"]} == {
-        *("camera", "side", "format", "at", "focus_distance_m")
+        *("camera", "side", "format", "at", "roi", "focus_distance_m")
     }

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from service.inference.artifact import Interval, load_model_folder
 from service.inference.cancellation import Cancellation, Cancelled
 from service.inference.estimator import Estimator
-from service.inference.pair import GraphPair
+from service.inference.pair import GraphPair, RawMaps
+from service.inference.part import Part
+from service.inference.tiles import OVERLAP_PX
 from service.optics import thin_lens
 from service.optics.camera import Camera, Intrinsics
 from tests.inference.oracle_pair import LOG_DEPTH_SCALE, blur_of, build_oracle_pair
@@ -148,6 +150,28 @@ def test_two_threads_get_the_answer_of_one(estimator: Estimator) -> None:
         thread.join()
     for level in levels:
         assert found[level] == pytest.approx(thin_lens.depth_near(expected_x(level), 2.0), rel=1e-4)
+
+
+def test_a_part_is_read_with_its_surroundings_and_no_more(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    estimator = Estimator.from_folder(load_model_folder(folder))
+    rgb = np.random.default_rng(0).integers(40, 130, (900, 1200, 3), np.uint8)
+    camera = Camera(1200, 900, 2.0, 6.0, 0.5)
+    whole, part = estimator.estimate(rgb, camera, "near"), Part(500, 400, 560, 430)
+    seen: list[tuple[int, ...]] = []
+    see = GraphPair.see
+
+    def noting(pair: GraphPair, tile: NDArray[np.uint8], cancellation: Cancellation) -> RawMaps:
+        seen.append(tile.shape)
+        return see(pair, tile, cancellation)
+
+    monkeypatch.setattr(GraphPair, "see", noting)
+    answer = estimator.estimate(rgb, camera, "near", part=part)
+    np.testing.assert_allclose(answer.depth_m, part.of(whole.depth_m), rtol=1e-5)
+    assert (answer.width_px, answer.height_px) == (60, 30)
+    assert (answer.camera.image_width_px, answer.camera.image_height_px) == (60, 30)
+    ((height, width, _),) = seen
+    assert 60 + 2 * OVERLAP_PX <= width < 60 + 2 * OVERLAP_PX + 16
+    assert 30 + 2 * OVERLAP_PX <= height < 30 + 2 * OVERLAP_PX + 16
 
 
 def test_a_camera_of_another_size_is_refused(estimator: Estimator) -> None:

@@ -1,0 +1,44 @@
+"""A part of a photograph that is asked for alone, and the surroundings it is read with."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+
+from service.errors import BadRequest, FieldProblem
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Columns ``left`` (included) to ``right`` (excluded) and rows ``top`` to ``bottom``, in pixels."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    def of(self, pixels: NDArray[Any]) -> NDArray[Any]:
+        """The part of a picture or map [h, w, ...], as a view."""
+        return pixels[self.top : self.bottom, self.left : self.right]
+
+    def require_within(self, width_px: int, height_px: int) -> None:
+        """Raises ``BadRequest`` where it is empty or leaves a photograph of that size."""
+        if not (0 <= self.left < self.right <= width_px and 0 <= self.top < self.bottom <= height_px):
+            detail = (
+                f"({self.left}, {self.top}) to ({self.right}, {self.bottom}) is no part of the upright photograph of "
+                f"{width_px}x{height_px} pixels."
+            )
+            raise BadRequest(detail, errors=(FieldProblem("roi", detail),))
+
+    def widened(self, margin_px: int, multiple: int, width_px: int, height_px: int) -> "Part":
+        """The part with a margin on every side, as far as the photograph goes, from multiples."""
+        return Part(
+            max(0, self.left - margin_px) // multiple * multiple,
+            max(0, self.top - margin_px) // multiple * multiple,
+            min(width_px, self.right + margin_px),
+            min(height_px, self.bottom + margin_px),
+        )
+
+    def within(self, outer: "Part") -> "Part":
+        """This part in the pixels of one that holds it."""
+        return Part(self.left - outer.left, self.top - outer.top, self.right - outer.left, self.bottom - outer.top)
