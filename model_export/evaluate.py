@@ -35,7 +35,7 @@ MODES: dict[str, Callable[[float], float]] = {
 }
 BLUR_RANGES_PX = (
     *((0.0, 0.5), (0.5, 1.0), (1.0, 2.0), (2.0, 4.0), (4.0, 8.0), (8.0, 16.0), (16.0, math.inf)),
-    *((0.6, 1.0), (1.0, 8.0)),
+    *((0.6, 1.0), (1.0, 8.0), (0.0, math.inf)),
 )
 SAMPLED_PIXELS = 3000
 REMEMBERED = 4
@@ -60,6 +60,12 @@ class Pixels:
     def certain(self, share: float = 0.5) -> NDArray[np.bool_]:
         """The share of the pixels with the least stated error."""
         return np.asarray(self.stated <= np.quantile(self.stated, share, method="lower"))
+
+    @property
+    def order(self) -> float:
+        """The mean error of the most certain tenth over that of the least certain half; 1: certainty says nothing."""
+        error, least_certain = np.abs(self.error), ~self.certain(0.5)
+        return float(error[self.certain(0.1)].mean() / error[least_certain].mean()) if least_certain.any() else 1.0
 
     @staticmethod
     def joined(parts: Sequence["Pixels"]) -> "Pixels":
@@ -108,7 +114,10 @@ class Summary:
 
 @dataclass(frozen=True, slots=True)
 class BlurRange:
-    """How lambda is read where the truth lies in a range: medians of the relative error, and its sign's."""
+    """How lambda is read where the truth lies in a range: medians of the relative error, and its sign's.
+
+    ``order`` is the mean error of the most certain tenth over that of the least certain half.
+    """
 
     name: str
     low_px: float
@@ -118,6 +127,7 @@ class BlurRange:
     certain_median: float
     p90: float
     bias: float
+    order: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,7 +234,6 @@ def summarise(name: str, mode: str, outcomes: Sequence[Outcome]) -> Summary:
         raise ValueError(f"{name}: no picture to score")
     depth = Pixels.joined([o.depth for o in outcomes])
     error = np.abs(depth.error)
-    least_certain = ~depth.certain(0.5)
     weights = [o.scored_pixels for o in outcomes]
     return Summary(
         name=name,
@@ -237,7 +246,7 @@ def summarise(name: str, mode: str, outcomes: Sequence[Outcome]) -> Summary:
         constant_mean=mean_scores([o.constant for o in outcomes]),
         median_error=float(np.median([o.median_error for o in outcomes])),
         certain_abs_rel=float(error[depth.certain(0.5)].mean()),
-        order=float(error[depth.certain(0.1)].mean() / error[least_certain].mean()) if least_certain.any() else 1.0,
+        order=depth.order,
         depth=depth,
     )
 
@@ -261,6 +270,7 @@ def blur_ranges(name: str, pixels: Pixels) -> list[BlurRange]:
                 certain_median=float(np.median(error[part.certain()])),
                 p90=float(np.quantile(error, 0.9)),
                 bias=float(np.median(part.error)),
+                order=part.order,
             )
         )
     return found

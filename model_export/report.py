@@ -25,7 +25,7 @@ DEPTH_HEAD = [
     *("pooled RMSE", "constant", "median error"),
 ]
 SCORES_HEAD = ["set", "camera", "over", "AbsRel", "MSE", "RMSE", "log10", "delta1", "delta2", "delta3"]
-BLUR_HEAD = ["scenes", "lambda px", "pixels", "median error", "certain half", "90th percentile", "bias"]
+BLUR_HEAD = ["scenes", "lambda px", "pixels", "median error", "certain half", "90th percentile", "bias", "order"]
 NOMINAL = np.linspace(0.05, 0.95, 19)
 BINS = 16
 LEAST_IN_BIN = 50
@@ -51,7 +51,7 @@ def _score_rows(s: Summary) -> list[list[str]]:
 def _blur_row(b: BlurRange) -> list[str]:
     span = f"{b.low_px:g}-{b.high_px:g}" if math.isfinite(b.high_px) else f"{b.low_px:g} and more"
     shares = (b.median, b.certain_median, b.p90)
-    return [b.name, span, f"{b.pixels:,}", *(f"{v:.1%}" for v in shares), f"{b.bias:+.1%}"]
+    return [b.name, span, f"{b.pixels:,}", *(f"{v:.1%}" for v in shares), f"{b.bias:+.1%}", f"{b.order:.2f}"]
 
 
 def tables(report: Report) -> dict[str, Table]:
