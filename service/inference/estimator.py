@@ -14,6 +14,8 @@ from service.inference.tiles import OVERLAP_PX, PIXEL_BUDGET, read_in_tiles
 from service.opencv import cv2
 from service.optics.camera import Camera
 
+# indoor frames with a k_cam of 20 px: RMSE 0.33 m at full size, 0.21 m on the copy where it is 12, 0.26 m where 8
+WELL_READ_K_CAM_PX = 12.0
 HIGH_BLUR = 0.8
 HIGH_BLUR_FRACTION = 0.02
 SECOND_SCALE = 1 / 3
@@ -87,8 +89,8 @@ class Estimator:
         )
 
     def _base_scale(self, camera: Camera) -> float:
-        """The largest copy whose k_cam the model was trained on; never an enlarged one."""
-        return min(1.0, self.manifest.ranges.k_cam_px.high / camera.k_cam_px)
+        """The largest copy whose k_cam the model reads well; never an enlarged one."""
+        return min(1.0, min(WELL_READ_K_CAM_PX, self.manifest.ranges.k_cam_px.high) / camera.k_cam_px)
 
     def _second_scale(self, first: Reading) -> float | None:
         """A smaller copy, where the first shows more blur than the model reads well; None without need."""
