@@ -4,9 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from rich.table import Table
 
@@ -90,12 +88,6 @@ def random_camera(seed: int) -> Trial:
         pose = draw_pose(rng, camera, GRID, float(depth_m))
         taken.append((f"{depth_m:.2f} m", "defocused", photograph(rng, camera, pose, GRID)))
     return Trial(camera, calibrate(Task(GRID), _pictures(taken)))
-
-
-def one_thread() -> None:
-    """For worker processes: each has a core."""
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
 
 
 def paper_pairs(number: float, pairs: int, seed: int = 0) -> list[tuple[Method, Trial]]:

@@ -5,10 +5,10 @@ Everything compared is timed in turns, so that what slows the machine slows all 
 
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import onnx
@@ -16,9 +16,11 @@ import onnxruntime
 import torch
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
+from torch.nn.utils import convert_conv2d_weight_memory_format
 from torch.utils.flop_counter import FlopCounterMode
 
 from model_export.config import TrainConfig
+from model_export.cores import torch_threads
 from model_export.export import export_pair
 from model_export.folded import folded
 from model_export.losses import correct
@@ -38,6 +40,7 @@ MATRIX = 1024
 CONVOLUTION = (64, 120, 160)  # channels, rows, columns
 SEED = 5
 
+K = TypeVar("K")
 Work = Callable[[], object]
 Picture = NDArray[np.uint8]
 
@@ -61,9 +64,9 @@ class Timing:
         return (high - low) / 2 / self.median_s
 
 
-def in_turns(works: Mapping[str, Work], rounds: int, on_round: Callable[[], None] = lambda: None) -> dict[str, Timing]:
+def in_turns(works: Mapping[K, Work], rounds: int, on_round: Callable[[], None] = lambda: None) -> dict[K, Timing]:
     """Every work once to warm up, then round by round, one after the other."""
-    spent: dict[str, list[float]] = {name: [] for name in works}
+    spent: dict[K, list[float]] = {name: [] for name in works}
     for number in range(rounds + 1):
         for name, work in works.items():
             started = time.perf_counter()
@@ -86,19 +89,8 @@ def camera_for(width_px: int, height_px: int, k_cam_px: float = 3.81) -> Camera:
     return Camera(width_px, height_px, 2.0, k_cam_px, 0.5)
 
 
-@contextmanager
-def torch_threads(count: int) -> Iterator[None]:
-    """torch on so many cores for a while."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
 def _eager(pair: Pair, picture: Picture, layout: torch.memory_format) -> Work:
-    pair.modules().eval().to(memory_format=layout)  # type: ignore[call-overload] # torch's stubs lack it
+    convert_conv2d_weight_memory_format(pair.modules().eval(), layout)
     image = (torch.from_numpy(picture).permute(2, 0, 1)[None].float() / 255).contiguous(memory_format=layout)
     gamma, k_cam = torch.tensor([0.5]), torch.tensor([3.81])
     scene = Scene(torch.tensor([2.0]), torch.zeros(1), torch.zeros(1))
@@ -118,18 +110,12 @@ def _through_runtime(folder: Path, picture: Picture, threads: int) -> Work:
     return lambda: pair.read(picture, camera, "auto", Cancellation(), Stopwatch())
 
 
-def paper_folder(folder: Path) -> Path:
-    """The paper's network, untrained, as a model folder: only its speed is of interest."""
-    export_pair(make_pair("paper"), TrainConfig(kind="paper"), 0, folder)
-    return folder
-
-
 @dataclass(frozen=True, slots=True)
 class NetworkRow:
-    """A way to run a network (paper, compact) at 640x480 with so many threads, beside the paper's two ways."""
+    """A network (paper, camind) at 640x480 through a library on so many threads, beside the paper's two ways."""
 
     network: str
-    name: str
+    through: str
     threads: int
     timing: Timing
     faster_than_eager: float
@@ -140,25 +126,25 @@ def time_networks(
     model: Path, scratch: Path, rounds: int, on_round: Callable[[], None] = lambda: None
 ) -> list[NetworkRow]:
     """The paper's network in PyTorch and in ONNX Runtime, and the model's graphs, by threads."""
-    picture = draw_picture(*SIZE)
-    paper = paper_folder(scratch / "paper")
+    picture, papers = draw_picture(*SIZE), scratch / "paper"
+    export_pair(make_pair("paper"), TrainConfig(kind="paper"), 0, papers)  # untrained: only its speed is of interest
+    eager, runtime = ("paper", "PyTorch"), ("paper", "ONNX Runtime")
     rows = []
     for threads in THREADS:
         with torch_threads(threads):
             timings = in_turns(
                 {
-                    "paper, PyTorch": _eager(make_pair("paper"), picture, torch.contiguous_format),
-                    "paper, PyTorch, channels last": _eager(make_pair("paper"), picture, torch.channels_last),
-                    "paper, ONNX Runtime": _through_runtime(paper, picture, threads),
-                    "camind, ONNX Runtime": _through_runtime(model, picture, threads),
+                    eager: _eager(make_pair("paper"), picture, torch.contiguous_format),
+                    ("paper", "PyTorch, channels last"): _eager(make_pair("paper"), picture, torch.channels_last),
+                    runtime: _through_runtime(papers, picture, threads),
+                    ("camind", "ONNX Runtime"): _through_runtime(model, picture, threads),
                 },
                 rounds,
                 on_round,
             )
-        eager, runtime = timings["paper, PyTorch"].median_s, timings["paper, ONNX Runtime"].median_s
-        for name, timing in timings.items():
-            network = "paper" if name.startswith("paper") else load_model_folder(model).manifest.kind
-            rows.append(NetworkRow(network, name, threads, timing, eager / timing.median_s, runtime / timing.median_s))
+        for (network, through), timing in timings.items():
+            ratios = (timings[way].median_s / timing.median_s for way in (eager, runtime))
+            rows.append(NetworkRow(network, through, threads, timing, *ratios))
     return rows
 
 
@@ -211,11 +197,8 @@ def machine_rates(threads: int, rounds: int, on_round: Callable[[], None] = lamb
         ),
     }
     with torch_threads(threads), torch.inference_mode():
-        timings = in_turns({" ".join(key): work for key, (_, work) in works.items()}, rounds, on_round)
-    return [
-        Rate(name, numbers, threads, operations / min(timings[f"{name} {numbers}"].seconds) / 1e9)
-        for (name, numbers), (operations, _) in works.items()
-    ]
+        timings = in_turns({key: work for key, (_, work) in works.items()}, rounds, on_round)
+    return [Rate(*key, threads, operations / min(timings[key].seconds) / 1e9) for key, (operations, _) in works.items()]
 
 
 def _bfloat16(work: Callable[[torch.Tensor, torch.Tensor], object], *values: torch.Tensor) -> Work:
@@ -267,7 +250,6 @@ class SizeRow:
 
     width_px: int
     height_px: int
-    k_cam_px: float
     timing: Timing
     cost_of_a_pixel: float
 
@@ -280,9 +262,6 @@ def time_sizes(model: Path, rounds: int, on_round: Callable[[], None] = lambda: 
         picture, camera = draw_picture(width_px, height_px), camera_for(width_px, height_px, NATIVE_K_CAM_PX)
         return lambda: estimator.estimate(picture, camera)
 
-    timings = in_turns({f"{w}x{h}": estimate(w, h) for w, h in SIZES}, rounds, on_round)
-    reference = timings["x".join(map(str, SIZE))].median_s / (SIZE[0] * SIZE[1])
-    return [
-        SizeRow(w, h, NATIVE_K_CAM_PX, timings[f"{w}x{h}"], timings[f"{w}x{h}"].median_s / (w * h) / reference)
-        for w, h in SIZES
-    ]
+    timings = in_turns({size: estimate(*size) for size in SIZES}, rounds, on_round)
+    of_a_pixel = {(w, h): timing.median_s / (w * h) for (w, h), timing in timings.items()}
+    return [SizeRow(*size, timing, of_a_pixel[size] / of_a_pixel[SIZE]) for size, timing in timings.items()]

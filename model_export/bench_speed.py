@@ -13,6 +13,7 @@ from rich.table import Table
 from model_export import bench_graphs, bench_service
 from model_export.bench_graphs import SIZE, THREADS, NetworkRow, Rate, SizeRow, Timing
 from model_export.bench_service import LoadRow, RequestRow
+from model_export.served import serving
 from service.inference.artifact import load_model_folder
 
 LARGE_ROUNDS = 3
@@ -49,13 +50,13 @@ def measure(model: Path, rounds: int, seconds: float, on_step: Callable[[], None
     rates = [rate for threads in THREADS for rate in bench_graphs.machine_rates(threads, LARGE_ROUNDS, on_step)]
     sizes = bench_graphs.time_sizes(model, LARGE_ROUNDS, on_step)
     memory = {}
-    with bench_service.serving(model) as service:
-        frame = bench_service.time_frames(service, rounds, on_step)
-        memory["640x480 frames"] = service.memory_mb("VmHWM")
-        load = bench_service.time_load(service, seconds, on_step)
-        memory["many clients"] = service.memory_mb("VmHWM")
-        large = bench_service.time_photographs(service, LARGE_ROUNDS, on_step)
-        memory["12-megapixel photographs"] = service.memory_mb("VmHWM")
+    with tempfile.TemporaryDirectory() as folder, serving(Path(folder) / "data", "--model", model.absolute()) as server:
+        frame = bench_service.time_frames(server, rounds, on_step)
+        memory["640x480 frames"] = server.peak_memory_bytes / 1e6
+        load = bench_service.time_load(server, seconds, on_step)
+        memory["many clients"] = server.peak_memory_bytes / 1e6
+        large = bench_service.time_photographs(server, LARGE_ROUNDS, on_step)
+        memory["12-megapixel photographs"] = server.peak_memory_bytes / 1e6
     return SpeedReport(
         model=manifest.name,
         machine={
@@ -64,7 +65,10 @@ def measure(model: Path, rounds: int, seconds: float, on_step: Callable[[], None
             "torch": torch.__version__,
             "onnxruntime": onnxruntime.__version__,
         },
-        gigaflops={kind: bench_graphs.graph_flops(kind, *SIZE) / 1e9 for kind in ("paper", manifest.kind)},
+        gigaflops={
+            network: bench_graphs.graph_flops(kind, *SIZE) / 1e9
+            for network, kind in (("paper", "paper"), ("camind", manifest.kind))
+        },
         networks=networks,
         rates=rates,
         sizes=sizes,
@@ -82,13 +86,7 @@ def steps(rounds: int) -> int:
 
 def tables(report: SpeedReport) -> list[Table]:
     """The report for a terminal."""
-    return [
-        _networks(report),
-        _rates(report),
-        _sizes(report),
-        _requests(report),
-        _load(report),
-    ]
+    return [_networks(report), _rates(report), _sizes(report), _requests(report), _load(report)]
 
 
 def _ms(timing: Timing) -> str:
@@ -107,7 +105,13 @@ def _networks(report: SpeedReport) -> Table:
     table = Table(*head, title="Networks")
     for row in report.networks:
         ratios = (f"{row.faster_than_eager:.1f}", f"{row.faster_than_runtime:.1f}")
-        table.add_row(row.name, str(row.threads), _ms(row.timing), *ratios, f"{report.share_of_machine(row):.0%}")
+        table.add_row(
+            f"{row.network}, {row.through}",
+            str(row.threads),
+            _ms(row.timing),
+            *ratios,
+            f"{report.share_of_machine(row):.0%}",
+        )
     return table
 
 

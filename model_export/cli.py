@@ -3,7 +3,6 @@
 import json
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -74,8 +73,8 @@ def train(
 
     if kind not in {"compact", "paper"}:
         raise _fail(f"--kind is compact or paper, not {kind}")
-    config = replace(
-        TrainConfig(steps=steps, seed=seed, learning_rate=learning_rate), kind="paper" if kind == "paper" else "compact"
+    config = TrainConfig(
+        kind="paper" if kind == "paper" else "compact", seed=seed, steps=steps, learning_rate=learning_rate
     )
     try:
         path = run_training(config, textures, run, weights=weights, workers=workers, device=device)
@@ -209,11 +208,12 @@ def calibration(
 
     with _training_parts():
         from model_export import bench_calibration as trials
+        from model_export.cores import one_core
 
     stdout = Console()
     with (
         progress_bar(Console(stderr=True)) as progress,
-        ProcessPoolExecutor(workers, get_context("forkserver"), initializer=trials.one_thread) as pool,
+        ProcessPoolExecutor(workers, get_context("forkserver"), initializer=one_core) as pool,
     ):
         found = list(progress.track(pool.map(trials.random_camera, range(cameras)), cameras, description="cameras"))
         if found:

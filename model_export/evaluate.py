@@ -5,18 +5,17 @@ without an answer is scored with the median of the picture's answers, and the sh
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from model_export.cases import UNSEEN_K_CAM_PX, Case, Trial
+from model_export.cores import torch_threads
 from model_export.metrics import Scores, best_constant, completed, mean_scores, pooled_scores, score
 from service.inference.artifact import ModelFolder, load_model_folder
 from service.inference.cancellation import Cancellation
@@ -299,17 +298,6 @@ def _examined(model: Path, on_progress: Callable[[str, int], None], trial: Trial
     return _Examined(trial.name, outcomes, first)
 
 
-@contextmanager
-def _one_core_each() -> Iterator[None]:
-    """Renderings side by side, rather than each in pieces on every core."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
 def evaluate(
     model: Path, trials: Sequence[Trial], on_progress: Callable[[str, int], None] = lambda _said, _finished: None
 ) -> Report:
@@ -317,7 +305,8 @@ def evaluate(
 
     ``on_progress`` hears, from any thread, of every picture, and how many sets that finishes.
     """
-    with _one_core_each(), ThreadPoolExecutor(SETS_AT_ONCE) as pool:
+    # renderings side by side, rather than each in pieces on every core
+    with torch_threads(1), ThreadPoolExecutor(SETS_AT_ONCE) as pool:
         done = list(pool.map(partial(_examined, model, on_progress), trials))
     outcomes = {(e.name, mode): scored for e in done for mode, scored in e.outcomes.items()}
     examples = {e.name: e.example for e in done if e.example is not None}

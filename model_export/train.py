@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.console import Console
+from torch.nn.utils import convert_conv2d_weight_memory_format
 from torch.utils.data import DataLoader, Dataset
 
 from model_export.config import SceneConfig, TrainConfig
@@ -196,7 +197,7 @@ class Trainer:
         self.config, self.device = config, torch.device(device)
         self.pair = make_pair(config.kind)
         self.modules = self.pair.modules().to(self.device)
-        self.modules.to(memory_format=torch.channels_last)  # type: ignore[call-overload] # torch's stubs lack it
+        convert_conv2d_weight_memory_format(self.modules, torch.channels_last)
         self.optimizer = torch.optim.AdamW(
             self.modules.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
         )
@@ -227,7 +228,7 @@ class Trainer:
         with self.autocast():
             loss, parts = total_loss(self.pair, batch, self.config)
         self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
+        torch.autograd.backward(loss)
         torch.nn.utils.clip_grad_norm_(self.modules.parameters(), self.config.clip_norm)
         self.optimizer.step()
         self.step += 1

@@ -6,7 +6,7 @@ Nothing else reads the environment, and nothing is read at import. A value out o
 import os
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -137,9 +137,9 @@ def load_settings(**overrides: object) -> Settings:
 
     Raises ``SettingsError``, one line per wrong value.
     """
-    given = {name: value for name, value in overrides.items() if value is not None}
+    given: dict[str, Any] = {name: value for name, value in overrides.items() if value is not None}
     try:
-        return Settings(**given)  # type: ignore[arg-type]  # pydantic checks them
+        return Settings(**given)
     except ValidationError as exc:
         raise SettingsError("\n".join(_fault_line(dict(fault)) for fault in exc.errors())) from exc
 

@@ -13,11 +13,11 @@ from typing import Any
 import pytest
 from httpx2 import Request
 
+from model_export.served import Reply, Server
+from model_export.served import serving as start
 from tests.fake_calibration import SETTINGS
 from tests.held_server import GO, write_command
 from tests.inference.photographs import corners, png
-from tests.server import Reply, Server
-from tests.server import serving as start
 
 RECEIVE_DEADLINE_S = 1.0
 CALIBRATION_RECEIVE_DEADLINE_S = 4.0

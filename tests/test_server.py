@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from tests.server import Server
-from tests.server import serving as start
+from model_export.served import Server
+from model_export.served import serving as start
 
 RECEIVE_DEADLINE_S = 1.0
 

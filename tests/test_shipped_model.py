@@ -12,13 +12,13 @@ from model_export.cases import FIXED, fixed_cases, is_textured
 from model_export.config import SceneConfig
 from model_export.evaluate import Examiner, summarise
 from model_export.render import refocus
+from model_export.served import Server, serving
 from model_export.textures import draw_texture
 from service.config import SHIPPED_MODEL
 from service.inference.artifact import load_model_folder
 from service.inference.estimator import Estimator
 from service.opencv import cv2
 from service.optics.camera import Camera
-from tests.server import Server, serving
 
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "coffee.jpg"
 MAX_BYTES = 12_000_000

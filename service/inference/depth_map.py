@@ -51,8 +51,7 @@ class DepthMap:
     def cut(self, part: Part) -> "DepthMap":
         """The maps of a part alone, with the camera behind it."""
         maps: dict[str, Any] = {name: part.of(getattr(self, name)) for name in (*Layers.__slots__, "valid")}
-        size = (part.right - part.left, part.bottom - part.top)
-        return replace(self, **maps, camera=self.camera.cropped(part.left, part.top, *size))
+        return replace(self, **maps, camera=part.behind(self.camera))
 
     @property
     def valid_fraction(self) -> float:

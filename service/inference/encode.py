@@ -182,10 +182,9 @@ def pixel_at(u: float, v: float, part: Part) -> tuple[int, int]:
     Raises ``BadRequest`` outside [left - 0.5, right - 0.5) x [top - 0.5, bottom - 0.5).
     """
     row, column = math.floor(v + 0.5) - part.top, math.floor(u + 0.5) - part.left
-    width_px, height_px = part.right - part.left, part.bottom - part.top
-    if not (0 <= row < height_px and 0 <= column < width_px):
+    if not (0 <= row < part.height_px and 0 <= column < part.width_px):
         of = f" from ({part.left}, {part.top})" if part.left or part.top else ""
-        detail = f"({u:g}, {v:g}) lies outside the upright photograph of {width_px}x{height_px} pixels{of}."
+        detail = f"({u:g}, {v:g}) lies outside the upright photograph of {part.width_px}x{part.height_px} pixels{of}."
         raise BadRequest(detail, errors=(FieldProblem("at", detail),))
     return row, column
 

@@ -67,8 +67,8 @@ class Estimator:
         if part is not None:
             margin_px = round(OVERLAP_PX / self._base_scale(camera))
             around = part.widened(margin_px, self.manifest.multiple, width, height)
-            seen_by = camera.cropped(around.left, around.top, around.right - around.left, around.bottom - around.top)
-            return self.estimate(around.of(rgb), seen_by, side, cancellation).cut(part.within(around))
+            read = self.estimate(around.of(rgb), around.behind(camera), side, cancellation)
+            return read.cut(part.within(around))
         stopwatch = Stopwatch()
         readings = [self._read(rgb, camera, self._base_scale(camera), side, cancellation, stopwatch)]
         second = self._second_scale(readings[0])

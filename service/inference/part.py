@@ -6,6 +6,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from service.errors import BadRequest, FieldProblem
+from service.optics.camera import Camera
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,9 +18,21 @@ class Part:
     right: int
     bottom: int
 
+    @property
+    def width_px(self) -> int:
+        return self.right - self.left
+
+    @property
+    def height_px(self) -> int:
+        return self.bottom - self.top
+
     def of(self, pixels: NDArray[Any]) -> NDArray[Any]:
         """The part of a picture or map [h, w, ...], as a view."""
         return pixels[self.top : self.bottom, self.left : self.right]
+
+    def behind(self, camera: Camera) -> Camera:
+        """The camera of a photograph as the one behind this part of it."""
+        return camera.cropped(self.left, self.top, self.width_px, self.height_px)
 
     def require_within(self, width_px: int, height_px: int) -> None:
         """Raises ``BadRequest`` where it is empty or leaves a photograph of that size."""

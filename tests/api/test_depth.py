@@ -7,6 +7,7 @@ import os
 import threading
 import time
 from collections.abc import MutableMapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -379,8 +380,7 @@ def test_ten_requests_leave_no_memory_behind(client: TestClient) -> None:
     body = jpeg(np.random.default_rng(0).integers(0, 200, (480, 640, 3), np.uint8))
 
     def resident_mb() -> float:
-        with open("/proc/self/statm", encoding="ascii") as stream:  # noqa: PTH123
-            return int(stream.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
     ask(client, body, {"Content-Type": "image/jpeg"})
     before_mb = resident_mb()

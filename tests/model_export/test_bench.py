@@ -9,8 +9,9 @@ from typer.testing import CliRunner
 
 from model_export import bench_graphs, bench_service
 from model_export.bench_graphs import Timing, graph_flops, in_turns, machine_rates
-from model_export.bench_service import serving, time_load
+from model_export.bench_service import time_load
 from model_export.cli import commands
+from model_export.served import serving
 
 
 @pytest.fixture
@@ -53,9 +54,9 @@ def test_our_graphs_stay_small() -> None:
 
 
 @pytest.mark.usefixtures("_small")
-def test_clients_are_all_answered(tiny_model_dir: Path) -> None:
-    with serving(tiny_model_dir) as service:
-        rows = time_load(service, 0.5)
+def test_clients_are_all_answered(tiny_model_dir: Path, tmp_path: Path) -> None:
+    with serving(tmp_path / "data", "--model", tiny_model_dir) as server:
+        rows = time_load(server, 0.5)
     assert [row.clients for row in rows] == [1, 3]
     for row in rows:
         assert row.answered > 0

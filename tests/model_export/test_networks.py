@@ -80,7 +80,7 @@ def test_ours_keeps_each_hypothesis_on_its_side_of_focus() -> None:
 def test_every_weight_learns_from_the_joint_loss(kind: Kind) -> None:
     pair = make_pair(kind)
     loss, parts = total_loss(pair, batch(), TrainConfig(kind=kind))
-    loss.backward()  # type: ignore[no-untyped-call]
+    torch.autograd.backward(loss)
     assert set(parts) == {"loss", "blur", "depth", "side"}
     for name, weight in pair.modules().named_parameters():
         assert weight.grad is not None, name

@@ -126,6 +126,6 @@ def test_gradients_are_those_of_finite_differences(formula: Callable[[Any], Any]
 
 def test_gradient_at_focus_is_finite_with_a_floor() -> None:
     blur = torch.tensor([0.5], dtype=torch.float64, requires_grad=True)
-    thin_lens.defocus_from_blur(blur, 0.5, floor_px=0.05).sum().backward()  # type: ignore[no-untyped-call]
+    torch.autograd.backward(thin_lens.defocus_from_blur(blur, 0.5, floor_px=0.05).sum())
     assert blur.grad is not None
     assert torch.isfinite(blur.grad).all()

@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 
 CAMIND = Path(sys.executable).parent / "camind"
 START_S = 60
+ANSWER_S = 300
 T = TypeVar("T")
 
 
@@ -51,9 +52,17 @@ class Server:
 
     @property
     def peak_memory_bytes(self) -> int:
-        """The most physical memory the process has held (VmHWM)."""
+        """The most physical memory the process has held."""
+        return self._memory_bytes("VmHWM")
+
+    @property
+    def memory_bytes(self) -> int:
+        """The physical memory the process holds now."""
+        return self._memory_bytes("VmRSS")
+
+    def _memory_bytes(self, what: str) -> int:
         status = Path(f"/proc/{self.process.pid}/status").read_text()
-        return int(re.findall(r"VmHWM:\s+(\d+) kB", status)[0]) * 1024
+        return int(re.findall(rf"{what}:\s+(\d+) kB", status)[0]) * 1024
 
     def connect(self) -> socket.socket:
         return socket.create_connection(("127.0.0.1", self.port), timeout=10)
@@ -61,7 +70,7 @@ class Server:
     def ask(
         self, method: str, path: str, body: bytes | str | None = None, headers: dict[str, str] | None = None
     ) -> Reply:
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=ANSWER_S)
         try:
             connection.request(method, path, body, headers or {})
             answer = connection.getresponse()
@@ -91,12 +100,13 @@ class Server:
     def poll(self, look: Callable[[], T | None]) -> T:
         give_up = time.monotonic() + START_S
         while time.monotonic() < give_up:
-            assert self.process.poll() is None, self.log
+            if self.process.poll() is not None:
+                raise RuntimeError(f"the service has ended:\n{self.log}")
             found = look()
             if found:
                 return found
             time.sleep(0.05)
-        raise AssertionError(f"not up within {START_S} s:\n{self.log}")
+        raise TimeoutError(f"not seen within {START_S} s:\n{self.log}")
 
 
 @contextmanager
