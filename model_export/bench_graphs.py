@@ -26,6 +26,7 @@ from model_export.folded import folded
 from model_export.losses import correct
 from model_export.networks import Pair, Scene, make_pair
 from model_export.textures import draw_texture
+from service.config import INT8
 from service.inference.artifact import load_model_folder
 from service.inference.cancellation import Cancellation
 from service.inference.estimator import Estimator
@@ -39,6 +40,8 @@ THREADS = (1, 2)
 MATRIX = 1024
 CONVOLUTION = (64, 120, 160)  # channels, rows, columns
 SEED = 5
+
+FLOAT32 = "float32"
 
 K = TypeVar("K")
 Work = Callable[[], object]
@@ -116,6 +119,7 @@ class NetworkRow:
 
     network: str
     through: str
+    numbers: str
     threads: int
     timing: Timing
     faster_than_eager: float
@@ -125,26 +129,33 @@ class NetworkRow:
 def time_networks(
     model: Path, scratch: Path, rounds: int, on_round: Callable[[], None] = lambda: None
 ) -> list[NetworkRow]:
-    """The paper's network in PyTorch and in ONNX Runtime, and the model's graphs, by threads."""
+    """The paper's network in PyTorch and in ONNX Runtime, and the model's graphs, in int8 too, by threads."""
     picture, papers = draw_picture(*SIZE), scratch / "paper"
     export_pair(make_pair("paper"), TrainConfig(kind="paper"), 0, papers)  # untrained: only its speed is of interest
-    eager, runtime = ("paper", "PyTorch"), ("paper", "ONNX Runtime")
+    eager, runtime = ("paper", "PyTorch", FLOAT32), ("paper", "ONNX Runtime", FLOAT32)
+    folders = {FLOAT32: model, INT8: model / INT8}
     rows = []
     for threads in THREADS:
         with torch_threads(threads):
             timings = in_turns(
                 {
                     eager: _eager(make_pair("paper"), picture, torch.contiguous_format),
-                    ("paper", "PyTorch, channels last"): _eager(make_pair("paper"), picture, torch.channels_last),
+                    ("paper", "PyTorch, channels last", FLOAT32): _eager(
+                        make_pair("paper"), picture, torch.channels_last
+                    ),
                     runtime: _through_runtime(papers, picture, threads),
-                    ("camind", "ONNX Runtime"): _through_runtime(model, picture, threads),
+                }
+                | {
+                    ("camind", "ONNX Runtime", numbers): _through_runtime(folder, picture, threads)
+                    for numbers, folder in folders.items()
+                    if folder.is_dir()
                 },
                 rounds,
                 on_round,
             )
-        for (network, through), timing in timings.items():
-            ratios = (timings[way].median_s / timing.median_s for way in (eager, runtime))
-            rows.append(NetworkRow(network, through, threads, timing, *ratios))
+        for way, timing in timings.items():
+            ratios = (timings[theirs].median_s / timing.median_s for theirs in (eager, runtime))
+            rows.append(NetworkRow(*way, threads, timing, *ratios))
     return rows
 
 
@@ -177,21 +188,21 @@ def machine_rates(threads: int, rounds: int, on_round: Callable[[], None] = lamb
     ia, ib = ((x * 100).to(torch.int8) for x in (ta, tb))
     product, convolution = 2 * MATRIX**3, 2 * 9 * channels**2 * rows * columns
     works: dict[tuple[str, str], tuple[int, Work]] = {
-        ("NumPy product", "float32"): (product, lambda: a @ b),
-        ("torch product", "float32"): (product, lambda: ta @ tb),
+        ("NumPy product", FLOAT32): (product, lambda: a @ b),
+        ("torch product", FLOAT32): (product, lambda: ta @ tb),
         ("torch product", "bfloat16"): (product, _bfloat16(lambda x, y: x @ y, ta, tb)),
-        ("torch product", "int8"): (product, lambda: torch._int_mm(ia, ib)),
-        ("torch convolution", "float32"): (convolution, lambda: torch.conv2d(tmaps, tweight, padding=1)),
+        ("torch product", INT8): (product, lambda: torch._int_mm(ia, ib)),
+        ("torch convolution", FLOAT32): (convolution, lambda: torch.conv2d(tmaps, tweight, padding=1)),
         ("torch convolution", "bfloat16"): (
             convolution,
             _bfloat16(lambda x, y: torch.conv2d(x, y, padding=1), tmaps, tweight),
         ),
-        ("ONNX Runtime product", "float32"): (product, _session(_product_graph(b), {"x": a}, threads)),
-        ("ONNX Runtime convolution", "float32"): (
+        ("ONNX Runtime product", FLOAT32): (product, _session(_product_graph(b), {"x": a}, threads)),
+        ("ONNX Runtime convolution", FLOAT32): (
             convolution,
             _session(_convolution_graph(weight), {"x": maps}, threads),
         ),
-        ("ONNX Runtime convolution", "int8"): (
+        ("ONNX Runtime convolution", INT8): (
             convolution,
             _session(_integer_convolution_graph(weight), {"x": (maps * 200).astype(np.uint8)}, threads),
         ),

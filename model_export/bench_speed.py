@@ -37,8 +37,9 @@ class SpeedReport:
         return asdict(self)
 
     def share_of_machine(self, row: NetworkRow) -> float:
-        """What the graphs compute in a second over the best float32 rate of any library on as many threads."""
-        best = max(r.giga_per_second for r in self.rates if r.numbers == "float32" and r.threads == row.threads)
+        """What the graphs compute in a second over the best rate of any library with such numbers and threads."""
+        alike = (rate for rate in self.rates if (rate.numbers, rate.threads) == (row.numbers, row.threads))
+        best = max(rate.giga_per_second for rate in alike)
         return self.gigaflops[row.network] / row.timing.median_s / best
 
 
@@ -96,17 +97,19 @@ def _ms(timing: Timing) -> str:
 def _networks(report: SpeedReport) -> Table:
     head = (
         "640x480",
+        "numbers",
         "threads",
         "ms",
         "times paper, PyTorch",
         "times paper, ONNX Runtime",
-        "of the machine's best float32",
+        "of the machine's best",
     )
     table = Table(*head, title="Networks")
     for row in report.networks:
         ratios = (f"{row.faster_than_eager:.1f}", f"{row.faster_than_runtime:.1f}")
         table.add_row(
             f"{row.network}, {row.through}",
+            row.numbers,
             str(row.threads),
             _ms(row.timing),
             *ratios,

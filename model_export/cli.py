@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from model_export.progress import progress_bar
+from service.config import INT8
 
 if TYPE_CHECKING:  # importing torch takes seconds; a command that needs it does so itself
     from model_export.verify import Difference
@@ -109,12 +110,15 @@ def export(
     out: Annotated[Path, typer.Option(help="model folder to write")],
     name: Annotated[str | None, typer.Option(help="name of the model")] = None,
 ) -> None:
-    """Write a checkpoint as a model folder: two ONNX graphs, card and manifest."""
+    """Write a checkpoint as a model folder, and in it one in int8: two ONNX graphs, card and manifest each."""
     with _training_parts():
         from model_export.export import export_checkpoint
+        from model_export.quantized import quantised_graphs
 
     manifest = export_checkpoint(checkpoint, textures, out, name)
     typer.echo(f"{manifest.name} in {out}")
+    small = export_checkpoint(checkpoint, textures, out / INT8, f"{manifest.name}-{INT8}", quantised_graphs)
+    typer.echo(f"{small.name} in {out / INT8}")
 
 
 @commands.command()

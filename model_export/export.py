@@ -3,6 +3,7 @@
 import logging
 import subprocess
 import warnings
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -74,10 +75,14 @@ def feature_names(count: int) -> tuple[str, ...]:
     return ("features",) if count == 1 else tuple(f"features_{i}" for i in range(count))
 
 
-def export_graphs(pair: Pair, folder: Path) -> Graphs:
-    """Write both graphs for any batch and any size that is a multiple of 16; what the manifest says of them."""
+def export_graphs(pair: Pair, folder: Path, *, fold: bool = True) -> Graphs:
+    """Write both graphs for any batch and any size that is a multiple of 16; what the manifest says of them.
+
+    Folded they are fastest in float32.
+    """
     pair.modules().eval()
-    pair = folded(pair)
+    if fold:
+        pair = folded(pair)
     height, width = EXAMPLE_SIZE
     image = torch.rand(2, 3, height, width)
     with torch.inference_mode():
@@ -174,7 +179,13 @@ def source_commit() -> str:
 
 
 def export_pair(
-    pair: Pair, config: TrainConfig, steps: int, folder: Path, name: str | None = None, sources: str = ""
+    pair: Pair,
+    config: TrainConfig,
+    steps: int,
+    folder: Path,
+    name: str | None = None,
+    sources: str = "",
+    write_graphs: Callable[[Pair, Path], Graphs] = export_graphs,
 ) -> Manifest:
     """Write a whole model folder for a pair; the manifest comes last and vouches for the rest.
 
@@ -183,7 +194,7 @@ def export_pair(
     folder.mkdir(parents=True, exist_ok=True)
     now = datetime.now(UTC).replace(microsecond=0)
     name = name or f"camind-{pair.kind}-{now:%Y%m%d}"
-    graphs = export_graphs(pair, folder)
+    graphs = write_graphs(pair, folder)
     ranges = trained_ranges(config.scenes)
     training = Training(commit=source_commit(), steps=steps, config=config.as_dict())
     (folder / CARD).write_text(card_text(name, ranges, training, parameter_count(pair), sources))
@@ -203,9 +214,15 @@ def export_pair(
     return manifest
 
 
-def export_checkpoint(checkpoint: Path, textures: Path, folder: Path, name: str | None = None) -> Manifest:
+def export_checkpoint(
+    checkpoint: Path,
+    textures: Path,
+    folder: Path,
+    name: str | None = None,
+    write_graphs: Callable[[Pair, Path], Graphs] = export_graphs,
+) -> Manifest:
     """Write the model folder of a checkpoint file; the card carries the licences that lie by the textures."""
     loaded = Checkpoint.load(checkpoint)
     licences = textures / LICENCES
     sources = licences.read_text() if licences.exists() else ""
-    return export_pair(loaded.pair(), loaded.config, loaded.step, folder, name, sources)
+    return export_pair(loaded.pair(), loaded.config, loaded.step, folder, name, sources, write_graphs)

@@ -23,12 +23,16 @@ SIDE_VISIBLE_PX = 0.3
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Images [n,3,h,w] in 0..1, q - 1 = s1/z - 1 as [n,1,h,w], and per image [n] its camera and side (-1/0/+1)."""
+    """Images [n,3,h,w] in 0..1, q - 1 = s1/z - 1 as [n,1,h,w], and per image [n] its camera and side (-1/0/+1).
+
+    ``told_gamma_px`` is what the correction is given: a guess where gamma is not known.
+    """
 
     image: Tensor
     excess: Tensor
     k_cam_px: Tensor
     gamma_px: Tensor
+    told_gamma_px: Tensor
     focus_distance_m: Tensor
     focal_length_px: Tensor
     side: Tensor
@@ -59,7 +63,7 @@ def correct(blur: BlurEstimate, gamma_px: Tensor, k_cam_px: Tensor, floor_px: fl
 def run_pair(pair: Pair, batch: Batch) -> tuple[BlurEstimate, DepthEstimate]:
     """Both networks with the camera correction between, in training's differentiable form."""
     blur: BlurEstimate = pair.blur(batch.image)
-    x, spread = correct(blur, batch.gamma_px, batch.k_cam_px, DEFOCUS_FLOOR_PX)
+    x, spread = correct(blur, batch.told_gamma_px, batch.k_cam_px, DEFOCUS_FLOOR_PX)
     depth: DepthEstimate = pair.depth(x, spread.detach(), batch.scene(), blur.features)
     return blur, depth
 

@@ -20,6 +20,9 @@ from service.optics.light import decode_srgb, encode_srgb
 
 SIDES = ("near", "far", "both")
 SIDE_SHARES = (0.45, 0.2, 0.35)
+ROOM_SHARE = 0.35
+WALL_SHARE = 0.6
+ROLL = 0.2
 LAYERED_SHARE = 0.7
 NEAREST_AT_MOST, FARTHEST_AT_LEAST = 0.5, 2.0
 CLOSE_SHARE = 0.5
@@ -35,6 +38,7 @@ PLAIN_SHARE = 0.35  # not compressed: the network must not need the noise of JPE
 RESCALED_SHARE = 0.15
 RESCALES = (1.2, 1.6)
 Map = NDArray[np.float32]
+Surface = tuple[Map, Map]  # alpha and q - 1 over the canvas
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,20 +157,45 @@ def _outline(rng: np.random.Generator, size: int) -> Map:
     return np.asarray(small, np.float32) / np.float32(255)
 
 
+def _apart(rng: np.random.Generator, shot: Shot, config: SceneConfig, count: int, size: int) -> list[Surface]:
+    """Shapes before a background, nearest first, at depths that have little to do with where they are."""
+    bounds = _excess_bounds(shot, config)
+    first, *others = (_draw_excess(rng, shot, config) for _ in range(count))
+    apart = rng.uniform(0, 1) if rng.random() < CLOSE_SHARE else 1.0  # what stands together is often alike in depth
+    middles = sorted((first, *(first + apart * (other - first) for other in others)), reverse=True)
+    *shapes, background = [_surface(rng, middle, bounds, size) for middle in middles]
+    return [*((_outline(rng, size), shape) for shape in shapes), (np.ones((size, size), np.float32), background)]
+
+
+def _room(rng: np.random.Generator, shot: Shot, config: SceneConfig, count: int, size: int) -> list[Surface]:
+    """Shapes that stand on a floor or a table, before a wall or none, nearest first: what is lower is nearer."""
+    far, near = sorted(_draw_excess(rng, shot, config) for _ in range(2))
+    roll = rng.normal(0, ROLL)
+    u = np.linspace(-1, 1, size, dtype=np.float32)[None, :]
+    down = math.cos(roll) * u.T + math.sin(roll) * u
+    ground = np.clip((far + near) / 2 + (near - far) / 2 * down, far, near)
+    if rng.random() < WALL_SHARE:
+        ground = np.maximum(ground, np.float32(far + rng.uniform(0, 0.7) * (near - far)))
+    standing = []
+    for outline in (_outline(rng, size) for _ in range(count - 1)):
+        rows, columns = np.nonzero(outline > 0.5)
+        if len(rows):
+            foot = rows.argmax()
+            standing.append((float(ground[rows[foot], columns[foot]]), outline))
+    standing.sort(key=lambda thing: -thing[0])
+    upright = [(outline, np.full((size, size), excess, np.float32)) for excess, outline in standing]
+    return [*upright, (np.ones((size, size), np.float32), np.asarray(ground, np.float32))]
+
+
 def draw_layers(
     rng: np.random.Generator, shot: Shot, config: SceneConfig, photographs: list[NDArray[np.uint8]]
 ) -> tuple[list[Layer], Map]:
     """The scene's surfaces, nearest first, and q - 1 of each over the canvas [layers,h,w]."""
     size = config.size_px + 2 * config.margin_px
-    bounds = _excess_bounds(shot, config)
     count = int(rng.integers(1, config.max_layers + 1)) if rng.random() < LAYERED_SHARE else 1
-    first, *others = (_draw_excess(rng, shot, config) for _ in range(count))
-    apart = rng.uniform(0, 1) if rng.random() < CLOSE_SHARE else 1.0  # what stands together is often alike in depth
-    middles = sorted((first, *(first + apart * (other - first) for other in others)), reverse=True)
+    surfaces = (_room if rng.random() < ROOM_SHARE else _apart)(rng, shot, config, count, size)
     layers: list[Layer] = []
-    excesses = np.stack([_surface(rng, middle, bounds, size) for middle in middles])
-    for i, excess in enumerate(excesses):
-        alpha = np.ones((size, size), np.float32) if i == count - 1 else _outline(rng, size)
+    for alpha, excess in surfaces:
         color = decode_srgb(draw_texture(rng, photographs, size)) * alpha[..., None]
         layers.append(
             Layer(
@@ -175,7 +204,7 @@ def draw_layers(
                 torch.from_numpy(-excess * np.float32(shot.k_cam_px)),
             )
         )
-    return layers, excesses
+    return layers, np.stack([excess for _, excess in surfaces])
 
 
 def _through_mosaic(linear: Map) -> Map:
@@ -190,7 +219,7 @@ def _through_mosaic(linear: Map) -> Map:
 def develop(rng: np.random.Generator, linear: Map, config: SceneConfig, *, through_mosaic: bool) -> NDArray[np.uint8]:
     """Light on the sensor [h,w,3] to a JPEG's pixels: exposure, noise, demosaic, white balance, tone, sharpening."""
     picture = linear * rng.uniform(0.5, 1.4) / max(float(np.quantile(linear, 0.98)), 0.2)
-    shot_noise, read_noise = _log_uniform(rng, (1e-6, 3e-4)), _log_uniform(rng, (1e-4, 2e-3))
+    shot_noise, read_noise = _log_uniform(rng, (1e-6, 2e-3)), _log_uniform(rng, (1e-4, 4e-3))
     noise = rng.standard_normal(picture.shape).astype(np.float32)
     spread = rng.uniform(0, 0.9)
     if spread > 0.3 and not through_mosaic:  # filters make noise of neighbours alike

@@ -4,6 +4,7 @@ Which scenes are in the pool at a step follows from the step alone, never from t
 is one run, however fast the scene workers are and however often it is stopped.
 """
 
+import math
 import os
 import time
 from collections import deque
@@ -30,6 +31,8 @@ from model_export.textures import load_photographs
 
 FOCAL_UNKNOWN_SHARE = 0.3
 SIDE_HINT_SHARE = 0.5
+TURNED_SHARE = 0.3  # most are left upright: below is nearer, as in most photographs
+GUESSED_GAMMA_SHARE, GUESSED_GAMMA_SPREAD = 0.3, 0.25  # a camera known by its specs has a guess for gamma
 HELD_OUT_SEED = 2**40
 
 
@@ -102,16 +105,18 @@ class Pool:
 
 
 def collate(samples: list[Sample], rng: np.random.Generator) -> Batch:
-    """Samples to tensors, each flipped and turned at random, focal length and side hint shown or not."""
+    """Samples to tensors, flipped and turned at random, focal length and side shown or not, gamma told or guessed."""
     images, excesses, rows = [], [], []
     for sample in samples:
-        turns, flip = int(rng.integers(4)), int(rng.choice([-1, 1]))
+        turns = int(rng.integers(4)) if rng.random() < TURNED_SHARE else 0
+        flip = int(rng.choice([-1, 1]))
         images.append(np.rot90(sample.image, turns, (1, 2))[:, :, ::flip].copy())
         excesses.append(np.rot90(sample.excess, turns)[:, ::flip].astype(np.float32))
         shot = sample.shot
         focal = 0.0 if rng.random() < FOCAL_UNKNOWN_SHARE else shot.focal_length_px
         side = shot.side if rng.random() < SIDE_HINT_SHARE else 0
-        rows.append((shot.k_cam_px, shot.gamma_px, shot.focus_distance_m, focal, side))
+        guess = math.exp(rng.normal(0, GUESSED_GAMMA_SPREAD)) if rng.random() < GUESSED_GAMMA_SHARE else 1.0
+        rows.append((shot.k_cam_px, shot.gamma_px, guess * shot.gamma_px, shot.focus_distance_m, focal, side))
     columns = torch.tensor(rows, dtype=torch.float32).unbind(1)
     image = torch.from_numpy(np.stack(images)).float() / 255
     excess = torch.from_numpy(np.stack(excesses))[:, None]

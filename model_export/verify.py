@@ -1,5 +1,6 @@
 """Torch against ONNX Runtime: a model folder answers as its checkpoint does."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,7 +43,7 @@ def verify_pair(pair: Pair, folder: Path) -> list[Difference]:
     differences = []
     for height, width in SIZES:
         image = _picture(height, width)
-        expected, feeds = _through_torch(pair, image, loaded.manifest.graphs.feature_names)
+        expected, feeds = through_torch(pair, image, CAMERA, loaded.manifest.graphs.feature_names)
         got = _run(blur, {"image": image}) | _run(depth, feeds)
         for name, value in expected.items():
             relative = float(np.abs(got[name] - value).max() / np.abs(value).max())
@@ -63,9 +64,14 @@ def _run(session: onnxruntime.InferenceSession, feeds: Arrays) -> Arrays:
     return dict(zip(names, session.run(names, wanted), strict=True))
 
 
-def _through_torch(pair: Pair, image: NDArray[np.float32], feature_names: tuple[str, ...]) -> tuple[Arrays, Arrays]:
-    """What torch answers, and what it fed its depth network: both graphs see the same inputs."""
-    one = {name: torch.tensor([value]) for name, value in CAMERA.items()}
+def through_torch(
+    pair: Pair, image: NDArray[np.float32], camera: Mapping[str, float], feature_names: tuple[str, ...]
+) -> tuple[Arrays, Arrays]:
+    """What torch answers for an image [1,3,h,w], and what it fed its depth network, by the graphs' names.
+
+    ``camera`` has the names of ``CAMERA``.
+    """
+    one = {name: torch.tensor([value]) for name, value in camera.items()}
     scene = Scene(one["focus_distance_m"], one["focal_length_px"], torch.zeros(1))
     pair.modules().eval()
     with torch.inference_mode():

@@ -91,7 +91,7 @@ def _start(app: FastAPI) -> None:
     engine = open_engine(settings.effective_database_url)
     if settings.is_database_embedded:
         schema.upgrade(engine)
-    folder = load_model_folder(settings.model_dir)
+    folder = load_model_folder(settings.served_model_dir)
     estimator = Estimator.from_folder(folder, intra_op_threads=settings.threads_per_worker)
     estimator.warm_up()
     app.state.engine = engine

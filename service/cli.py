@@ -52,7 +52,7 @@ def serve(
     logs.configure(settings.log_level, settings.log_format)
     with _plain_failures():
         listener = server.bind(settings.host, settings.port)
-        load_model_folder(settings.model_dir)
+        load_model_folder(settings.served_model_dir)
         if settings.is_database_embedded:
             _migrated(settings).dispose()
     typer.echo(f"camind on http://{settings.host}:{listener.getsockname()[1]}", err=True)

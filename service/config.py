@@ -13,6 +13,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 ENV_PREFIX = "CAMIND_"
 SHIPPED_MODEL = Path(__file__).parent / "models"
+INT8 = "int8"  # the folder, in a model folder, of the same model in int8
 DATABASE_FILE = "camind.sqlite3"
 DATABASE_SCHEMES = ("sqlite", "postgresql+psycopg")
 
@@ -44,6 +45,9 @@ class Settings(BaseSettings):
         str, Field(description="SQLite or PostgreSQL (postgresql+psycopg://); empty: a file in data_dir")
     ] = ""
     model_dir: Annotated[Path, Field(description="Model folder to serve; default: the shipped model")] = SHIPPED_MODEL
+    precision: Annotated[
+        Literal["float32", "int8"], Field(description="Numbers the graphs compute with; int8: model_dir/int8")
+    ] = "float32"
 
     host: Annotated[str, Field(min_length=1, description="Address to bind; default: this machine only")] = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535, description="TCP port; 0 lets the system choose")] = 8000
@@ -107,6 +111,11 @@ class Settings(BaseSettings):
     def threads_per_worker(self) -> int:
         """Threads inside one graph run; times ``worker_slots`` at most the cores."""
         return self.intra_op_threads or max(1, available_cores() // self.worker_slots)
+
+    @property
+    def served_model_dir(self) -> Path:
+        """The model folder whose graphs compute with the numbers that are wanted."""
+        return self.model_dir / INT8 if self.precision == INT8 else self.model_dir
 
     @property
     def effective_database_url(self) -> str:

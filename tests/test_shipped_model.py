@@ -1,5 +1,6 @@
 """The model in the repository, through the real service: the README's requests, and metres that make sense."""
 
+import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,9 +15,10 @@ from model_export.evaluate import Examiner, summarise
 from model_export.render import refocus
 from model_export.served import Server, serving
 from model_export.textures import draw_texture
-from service.config import SHIPPED_MODEL
+from service.config import INT8, SHIPPED_MODEL
 from service.inference.artifact import load_model_folder
 from service.inference.estimator import Estimator
+from service.inference.pair import GraphPair
 from service.opencv import cv2
 from service.optics.camera import Camera
 
@@ -98,12 +100,32 @@ def estimator() -> Estimator:
     return Estimator.from_folder(load_model_folder(SHIPPED_MODEL), intra_op_threads=1)
 
 
-def test_it_scores_what_its_card_says() -> None:
-    examiner = Examiner(SHIPPED_MODEL)
+@pytest.mark.parametrize("folder", [SHIPPED_MODEL, SHIPPED_MODEL / INT8], ids=["float32", "int8"])
+def test_it_scores_what_its_card_says(folder: Path) -> None:
+    examiner = Examiner(folder)
     found = summarise(FIXED, "gt", [examiner.answer(case)[0] for case in fixed_cases()])
-    recorded = load_model_folder(SHIPPED_MODEL).manifest.scores
+    recorded = load_model_folder(folder).manifest.scores
     assert found.mean.abs_rel == pytest.approx(recorded["fixed.abs_rel"], rel=0.02)
     assert found.pooled.rmse == pytest.approx(recorded["fixed.rmse_m"], rel=0.02)
+
+
+def test_int8_is_served_when_set_and_answers_nearly_the_same(server: Server, tmp_path: Path) -> None:
+    with serving(tmp_path / "data", settings={"CAMIND_PRECISION": "int8"}) as small:
+        assert small.ask("GET", "/model").json()["manifest"]["name"].endswith("-int8")
+        assert small.add(D200) == 201
+        maps = [np.load(io.BytesIO(ask(one, PICTURE.read_bytes(), "&format=npy"))) for one in (server, small)]
+    change = np.abs(np.log(maps[1] / maps[0]))
+    assert 0 < np.nanmedian(change) < 0.03
+
+
+def test_tiles_show_no_seams() -> None:
+    """A photograph read in tiles answers as when it is read at once."""
+    small = cv2.imdecode(np.frombuffer(PICTURE.read_bytes(), np.uint8), cv2.IMREAD_COLOR_RGB)
+    picture = np.asarray(cv2.resize(np.asarray(small), (1200, 800)), np.uint8)
+    camera, pair = Camera(1200, 800, 2.0, 5.0, 0.6), GraphPair(load_model_folder(SHIPPED_MODEL), 1)
+    whole, tiled = (Estimator(pair, budget).estimate(picture, camera, "near").depth_m for budget in (10**6, 550_000))
+    change = np.abs(np.log(np.divide(tiled, whole)))
+    assert 0 < np.nanquantile(change, 0.98) < 0.01
 
 
 @pytest.mark.parametrize("seed", [11, 12, 14, 17])

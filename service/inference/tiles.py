@@ -78,21 +78,27 @@ def spans(size: int, count: int, multiple: int) -> list[Span]:
 
 
 def fades(along: list[Span], stride: int) -> list[NDArray[np.float32]]:
-    """A weight per map pixel of each span: it falls towards neighbours, and all sum to 1 everywhere."""
+    """A weight per map pixel of each span: it falls softly towards neighbours, and all sum to 1 everywhere."""
     total = np.zeros(-(-along[-1].stop // stride))
     weights = []
     for place, span in enumerate(along):
         centres = np.arange(span.start // stride, -(-span.stop // stride)) * stride + stride / 2
         weight = np.ones(len(centres))
         if place:
-            weight *= np.clip((centres - span.start) / (along[place - 1].stop - span.start), 0, 1)
+            weight *= _soft_step((centres - span.start) / (along[place - 1].stop - span.start))
         if place + 1 < len(along):
-            weight *= np.clip((span.stop - centres) / (span.stop - along[place + 1].start), 0, 1)
+            weight *= _soft_step((span.stop - centres) / (span.stop - along[place + 1].start))
         first = span.start // stride
         total[first : first + len(weight)] += weight
         weights.append((first, weight))
     # three spans may share a pixel where the photograph is little larger than two
     return [(weight / total[first : first + len(weight)]).astype(np.float32) for first, weight in weights]
+
+
+def _soft_step(t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """From 0 at 0 to 1 at 1, level at both: a tile's edge, where it knows least of what surrounds it, counts least."""
+    t = np.clip(t, 0, 1)
+    return t * t * (3 - 2 * t)
 
 
 class _Merge:

@@ -2,9 +2,11 @@
 
 from pathlib import Path
 
+import onnx
 import pytest
 import torch
 
+from model_export import quantized
 from model_export.card import record_scores
 from model_export.config import Kind, TrainConfig
 from model_export.export import export_pair
@@ -12,6 +14,7 @@ from model_export.networks import Pair, make_pair
 from model_export.verify import SIZES, TOLERANCE, verify_pair
 from service.inference.artifact import load_model_folder
 
+INT8_TOLERANCE = 0.05
 KINDS: list[Kind] = ["compact", "paper"]
 
 
@@ -23,6 +26,15 @@ def untrained(kind: Kind) -> Pair:
             torch.nn.init.uniform_(module.running_mean, -0.1, 0.1)  # type: ignore[arg-type]
             torch.nn.init.uniform_(module.running_var, 0.5, 1.5)  # type: ignore[arg-type]
     return pair
+
+
+@pytest.fixture(scope="module")
+def in_int8(tmp_path_factory: pytest.TempPathFactory) -> tuple[Pair, Path]:
+    pair, folder = untrained("compact"), tmp_path_factory.mktemp("int8")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(quantized, "SCENES", 3)
+        export_pair(pair, TrainConfig(), 0, folder, write_graphs=quantized.quantised_graphs)
+    return pair, folder
 
 
 @pytest.fixture(scope="module", params=KINDS)
@@ -37,6 +49,20 @@ def test_onnx_runtime_answers_as_torch_on_three_sizes(exported: tuple[Pair, Path
     differences = verify_pair(*exported)
     assert {(d.height_px, d.width_px) for d in differences} == set(SIZES)
     assert max(d.relative for d in differences) <= TOLERANCE
+
+
+def test_int8_answers_nearly_as_torch_and_computes_in_int8(in_int8: tuple[Pair, Path]) -> None:
+    blur = [d.relative for d in verify_pair(*in_int8) if d.output == "blur_px"]
+    assert 0 < max(blur) < INT8_TOLERANCE
+    folder = load_model_folder(in_int8[1])
+    for graph in (folder.blur_graph, folder.depth_graph):
+        model = onnx.load(graph)
+        made = {name: node.op_type for node in model.graph.node for name in node.output}
+        convolutions = [node for node in model.graph.node if node.op_type == "Conv"]
+        in_int8_inside = [node for node in convolutions if made.get(node.input[0]) == "DequantizeLinear"]
+        assert len(in_int8_inside) >= 14
+        assert convolutions[0] not in in_int8_inside
+        assert convolutions[-1] not in in_int8_inside
 
 
 def test_verify_notices_other_weights(exported: tuple[Pair, Path]) -> None:

@@ -1,0 +1,91 @@
+"""The pair in int8: U8S8, per channel, with the front ends, the first and the last convolutions in float32.
+
+What is quantised is the pair as it was trained, norms folded: enlarging and joining cost next to nothing in int8, and
+``folded``'s sums of two convolutions would go back to float32 each. Weights have seven bits (``reduce_range``), because
+AVX2 without integer dot products adds pairs of products in sixteen.
+"""
+
+import logging
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
+from onnxruntime.quantization.shape_inference import quant_pre_process
+
+from model_export.config import SceneConfig
+from model_export.export import export_graphs
+from model_export.networks import Pair
+from model_export.scenes import draw_sample
+from model_export.verify import CAMERA, through_torch
+from service.inference.artifact import GraphFile, Graphs, sha256_of
+
+SCENES = 48
+FIRST_SEED = 2**41  # neither a training's nor a held-out scene's
+QUANTISED = ("Conv", "Relu", "MaxPool", "Resize", "Concat", "Add")
+
+Feeds = dict[str, NDArray[np.float32]]
+
+
+class _Feeds(CalibrationDataReader):  # type: ignore[misc] # its package is not typed
+    """Feeds one by one, as the quantiser asks for them."""
+
+    def __init__(self, feeds: list[Feeds]) -> None:
+        self._feeds = iter(feeds)
+
+    def get_next(self) -> Feeds | None:
+        return next(self._feeds, None)
+
+
+def quantised_graphs(pair: Pair, folder: Path) -> Graphs:
+    """Write both graphs in int8, their ranges taken from generated scenes; what the manifest says of them."""
+    with tempfile.TemporaryDirectory() as scratch:
+        graphs = export_graphs(pair, Path(scratch), fold=False)
+        blur, depth = zip(*_scene_feeds(pair, graphs.feature_names), strict=True)
+        return Graphs(
+            blur=_quantised(graphs.blur, Path(scratch), list(blur), folder),
+            depth=_quantised(graphs.depth, Path(scratch), list(depth), folder),
+        )
+
+
+def _scene_feeds(pair: Pair, feature_names: tuple[str, ...]) -> Iterator[tuple[Feeds, Feeds]]:
+    """What the blur graph and the depth graph are given for generated scenes."""
+    for number in range(SCENES):
+        sample = draw_sample(FIRST_SEED + number, SceneConfig(), [])
+        image = sample.image[None].astype(np.float32) / np.float32(255)
+        camera = {name: getattr(sample.shot, name) for name in CAMERA}
+        yield {"image": image}, through_torch(pair, image, camera, feature_names)[1]
+
+
+def _quantised(graph: GraphFile, scratch: Path, feeds: list[Feeds], folder: Path) -> GraphFile:
+    prepared = scratch / f"prepared-{graph.file}"
+    quant_pre_process(scratch / graph.file, prepared, skip_symbolic_shape=True)
+    level = logging.root.level
+    logging.root.setLevel(logging.ERROR)  # it warns of what has been done
+    try:
+        quantize_static(
+            prepared,
+            folder / graph.file,
+            _Feeds(feeds),
+            quant_format=QuantFormat.QDQ,
+            activation_type=QuantType.QUInt8,
+            weight_type=QuantType.QInt8,
+            per_channel=True,
+            reduce_range=True,
+            nodes_to_quantize=_between_first_and_last(onnx.load(prepared)),
+        )
+    finally:
+        logging.root.setLevel(level)
+    onnx.checker.check_model(onnx.load(folder / graph.file), full_check=True)
+    return graph.model_copy(update={"sha256": sha256_of(folder / graph.file)})
+
+
+def _between_first_and_last(model: onnx.ModelProto) -> list[str]:
+    """Nodes after the first and before the last convolution of the network, whose weights have names."""
+    nodes = list(model.graph.node)
+    learned = [i for i, node in enumerate(nodes) if node.op_type == "Conv" and node.input[1].startswith("network.")]
+    inner = nodes[learned[0] + 1 : learned[-1]]
+    return [node.name for node in inner if node.op_type in QUANTISED]
