@@ -11,6 +11,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from service.api.problems import PROBLEM_TYPE, problem
 from service.config import Settings
 from service.errors import BadRequest, CamindError, ReceiveTimeout
+from service.memory import keep_freed_memory
 
 GRACE_S = 1.0
 BACKLOG = 2048
@@ -123,6 +124,7 @@ def bind(host: str, port: int) -> socket.socket:
 
 def serve(app: FastAPI, settings: Settings, listener: socket.socket) -> bool:
     """Answer on the socket until told to stop; whether the app ever started."""
+    keep_freed_memory()
     protocol = type("Protocol", (DeadlineProtocol,), {"deadline_s": settings.receive_deadline_s + GRACE_S})
     config = uvicorn.Config(
         app,

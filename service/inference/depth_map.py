@@ -9,13 +9,12 @@ from numpy.typing import NDArray
 
 from service.inference.pair import RawMaps, Side
 from service.inference.part import Part
-from service.inference.resampling import Axis, sample
+from service.inference.resampling import Ratio, sample
 from service.optics import thin_lens
 from service.optics.camera import Camera
 
 MAX_RELATIVE_ERROR = 1.0
 SIGMA_OF_LAPLACE = np.float32(2**0.5)
-ROWS_AT_ONCE = 128
 
 Array = NDArray[np.float32]
 
@@ -72,31 +71,27 @@ class Reading:
     near_m: Array
     far_m: Array
     error: Array
-    rows: Axis
-    columns: Axis
+    ratio: Ratio
 
     @classmethod
     def of(cls, maps: RawMaps, camera: Camera, photograph_size: tuple[int, int], stride: int) -> Self:
         """``photograph_size`` is (height, width)."""
-        height, width = photograph_size
-        map_rows, map_columns = maps["blur_px"].shape
         x = thin_lens.relative_defocus_from_blur(maps["blur_px"], camera.gamma_px, camera.k_cam_px)
         focus_m = np.float32(camera.focus_distance_m)
         return cls(
             maps,
             camera,
-            camera.image_width_px / width,
+            camera.image_width_px / photograph_size[1],
             np.exp(maps["log_ratio_near"]) * focus_m,
             np.where(x < 1, np.exp(maps["log_ratio_far"]) * focus_m, np.float32(np.nan)),
             np.exp(maps["log_scale"]) * SIGMA_OF_LAPLACE,
-            Axis.between(height, camera.image_height_px, stride, map_rows),
-            Axis.between(width, camera.image_width_px, stride, map_columns),
+            Ratio.between(photograph_size, (camera.image_height_px, camera.image_width_px), stride),
         )
 
 
 @dataclass(frozen=True, slots=True)
 class Layers:
-    """The float maps of a photograph, or of some of its rows."""
+    """The float maps of a photograph."""
 
     depth_m: Array
     depth_alt_m: Array
@@ -104,18 +99,10 @@ class Layers:
     sigma_m: Array
     blur_px: Array
 
-    @classmethod
-    def empty(cls, height: int, width: int) -> Self:
-        return cls(*(np.empty((height, width), np.float32) for _ in cls.__slots__))
-
-    def rows(self, start: int, stop: int) -> "Layers":
-        """Views of some rows."""
-        return Layers(*(getattr(self, name)[start:stop] for name in self.__slots__))
-
-    def take(self, other: "Layers", where: NDArray[np.bool_] | None = None) -> None:
-        """Copy layers of the same size, everywhere or where told."""
+    def take(self, other: "Layers", where: NDArray[np.bool_]) -> None:
+        """Copy layers of the same size where told."""
         for name in self.__slots__:
-            np.copyto(getattr(self, name), getattr(other, name), where=True if where is None else where)
+            np.copyto(getattr(self, name), getattr(other, name), where=where)
 
     def hide_unanswered(self) -> NDArray[np.bool_]:
         """Which pixels have an answer; NaN goes where there is none."""
@@ -128,39 +115,29 @@ class Layers:
 
 
 def decide(readings: list[Reading], size: tuple[int, int], side: Side) -> tuple[Layers, NDArray[np.bool_]]:
-    """Layers (height, width) and which pixels have an answer; the surest reading wins, pixel by pixel.
+    """Layers (height, width) and which pixels have an answer; the surest reading wins, pixel by pixel."""
+    first, *others = readings
+    layers, least = _told(first, size, side)
+    for reading in others:
+        told, error = _told(reading, size, side)
+        layers.take(told, error < least)
+        np.fmin(least, error, out=least)
+    return layers, layers.hide_unanswered()
 
-    Rows are done in bands: a photograph of 12 megapixels would need a gigabyte at once.
+
+def _told(reading: Reading, size: tuple[int, int], side: Side) -> tuple[Layers, Array]:
+    """Layers from one reading, and the relative error of depth there.
+
+    The side is what the network tells unless it is given; where no far answer can exist it is near, always.
     """
-    height, width = size
-    layers, valid = Layers.empty(height, width), np.empty((height, width), np.bool_)
-    for start in range(0, height, ROWS_AT_ONCE):
-        stop = min(start + ROWS_AT_ONCE, height)
-        band, best = layers.rows(start, stop), None
-        for reading in readings:
-            told, error = _band(reading, start, stop, side)
-            band.take(told, None if best is None else error < best)
-            best = error if best is None else np.fmin(best, error)
-        valid[start:stop] = band.hide_unanswered()
-    return layers, valid
-
-
-def _band(reading: Reading, start: int, stop: int, side: Side) -> tuple[Layers, Array]:
-    """Layers of some rows from one reading, and the relative error of depth there."""
-    rows, columns = reading.rows.part(start, stop), reading.columns
-    near_m, far_m = sample(reading.near_m, rows, columns), sample(reading.far_m, rows, columns)
-    error = sample(reading.error, rows, columns)
-    p_near = _p_near(sample(reading.maps["p_near"], rows, columns), np.isfinite(far_m), side)
+    near_m, far_m, error, p_near, blur_px = (
+        sample(values, reading.ratio, size)
+        for values in (reading.near_m, reading.far_m, reading.error, reading.maps["p_near"], reading.maps["blur_px"])
+    )
+    if side != "auto":
+        p_near.fill(side == "near")
+    np.copyto(p_near, 1, where=np.isnan(far_m))
     is_near = p_near >= 0.5
     depth_m = np.where(is_near, near_m, far_m)
-    blur_px = sample(reading.maps["blur_px"], rows, columns)
     blur_px /= np.float32(reading.scale)
     return Layers(depth_m, np.where(is_near, far_m, near_m), p_near, error * depth_m, blur_px), error
-
-
-def _p_near(told: Array, has_far: NDArray[np.bool_], side: Side) -> Array:
-    """What the network tells unless the side is given; where no far answer can exist it is near, always."""
-    if side == "near":
-        return np.ones_like(told)
-    asked = np.zeros_like(told) if side == "far" else np.clip(told, 0, 1)
-    return np.where(has_far, asked, np.float32(1))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from service.errors import BadRequest, FieldProblem
 from service.inference.depth_map import DepthMap
 from service.inference.part import Part
+from service.inference.png import grey_png
 from service.inference.preview import render_preview
 from service.opencv import cv2
 
@@ -69,11 +70,7 @@ def encode_png(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
     millimetres = np.rint(np.nan_to_num(answer.depth_m, nan=0.0, posinf=0.0) / MILLIMETRE)
     beyond = millimetres > LARGEST_MILLIMETRES
     millimetres[beyond] = 0
-    body = _written(
-        ".png",
-        millimetres.astype(np.uint16),
-        (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP),
-    )
+    body = grey_png(millimetres.astype(np.uint16))
     lost = f"{beyond.mean():.1%} of the pixels lie beyond the 65.535 m a 16-bit PNG can hold and read 0"
     return Encoded(body, MEDIA_TYPES["png"], MILLIMETRE, (lost,) if beyond.any() else ())
 
@@ -131,8 +128,8 @@ def encode_ply(answer: DepthMap, rgb: NDArray[np.uint8]) -> Encoded:
 def encode_preview(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
     """JPEG in turbo colours, near red and far blue, grey without an answer, with a legend in metres."""
     pixels = render_preview(answer.depth_m)
-    body = _written(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), (cv2.IMWRITE_JPEG_QUALITY, 90))
-    return Encoded(body, MEDIA_TYPES["preview"])
+    body = cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), (cv2.IMWRITE_JPEG_QUALITY, 90))[1]
+    return Encoded(body.tobytes(), MEDIA_TYPES["preview"])
 
 
 ENCODERS: dict[str, Callable[[DepthMap, NDArray[np.uint8]], Encoded]] = {
@@ -191,13 +188,6 @@ def pixel_at(u: float, v: float, part: Part) -> tuple[int, int]:
 
 def _number_or_none(value: np.float32) -> float | None:
     return float(value) if np.isfinite(value) else None
-
-
-def _written(kind: str, pixels: NDArray[np.integer | np.floating], options: tuple[int, ...]) -> bytes:
-    is_written, body = cv2.imencode(kind, pixels, options)
-    if not is_written:
-        raise RuntimeError(f"OpenCV cannot write {kind}")
-    return body.tobytes()
 
 
 def _ply_header(count: int) -> bytes:

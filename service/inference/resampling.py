@@ -1,48 +1,29 @@
-"""Maps at any pixel of the photograph: bilinear, with pixel centres where the conventions put them."""
+"""Maps at every pixel of the photograph: bilinear, with pixel centres where the conventions put them."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from service.opencv import cv2
 
-@dataclass(frozen=True, slots=True)
-class Axis:
-    """For each pixel of the photograph along one axis: the map's pixel before it, that after, its share."""
 
-    before: NDArray[np.intp]
-    after: NDArray[np.intp]
-    share: NDArray[np.float32]
+class Ratio(NamedTuple):
+    """Pixels of a map per pixel of the photograph, along each axis.
+
+    Centres follow from areas: row v of the photograph lies at (v + 1/2) * rows - 1/2 of the map.
+    """
+
+    rows: float
+    columns: float
 
     @classmethod
-    def between(cls, photograph_px: int, working_px: int, stride: int, map_px: int) -> "Axis":
-        """From a photograph to a copy resized to ``working_px`` whose map has one pixel per ``stride``.
-
-        Centres follow from areas: u of the photograph lies at (u + 1/2) * ratio - 1/2 of the map.
-        """
-        ratio = working_px / (photograph_px * stride)
-        at = np.clip((np.arange(photograph_px) + 0.5) * ratio - 0.5, 0, map_px - 1)
-        before = np.floor(at).astype(np.intp)
-        return cls(before, np.minimum(before + 1, map_px - 1), (at - before).astype(np.float32))
-
-    def part(self, start: int, stop: int) -> "Axis":
-        return Axis(self.before[start:stop], self.after[start:stop], self.share[start:stop])
+    def between(cls, photograph_size: tuple[int, int], working_size: tuple[int, int], stride: int) -> "Ratio":
+        """From a photograph (height, width) to a copy resized to another, whose map has a pixel per ``stride``."""
+        return cls(*(working / (whole * stride) for whole, working in zip(photograph_size, working_size, strict=True)))
 
 
-def sample(values: NDArray[np.float32], rows: Axis, columns: Axis) -> NDArray[np.float32]:
-    """The map [h, w] at every crossing of the axes: float32 [len(rows), len(columns)]."""
-    first = int(rows.before[0])
-    band = values[first : int(rows.after[-1]) + 1]
-    # along the last axis first: the band has fewer rows than the photograph
-    wide = _between(band.take(columns.before, axis=1), band.take(columns.after, axis=1), columns.share)
-    return _between(wide[rows.before - first], wide[rows.after - first], rows.share[:, np.newaxis])
-
-
-def _between(
-    before: NDArray[np.float32], after: NDArray[np.float32], share: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """``before`` moved by ``share`` towards ``after``, in place of both."""
-    after -= before
-    after *= share
-    before += after
-    return before
+def sample(values: NDArray[np.float32], ratio: Ratio, size: tuple[int, int]) -> NDArray[np.float32]:
+    """The map [h, w] at every pixel of a photograph of that size (height, width); its edges are continued."""
+    large = cv2.resize(values, None, fx=1 / ratio.columns, fy=1 / ratio.rows, interpolation=cv2.INTER_LINEAR)
+    return np.asarray(large, np.float32)[: size[0], : size[1]]

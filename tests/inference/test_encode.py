@@ -22,6 +22,7 @@ from service.inference.encode import (
     read_point,
     spread_of,
 )
+from service.inference.png import grey_png
 from service.opencv import cv2
 from service.optics.camera import Camera, Intrinsics
 
@@ -62,6 +63,12 @@ def test_png_holds_millimetres_and_zero_for_no_answer(answer: DepthMap) -> None:
     assert encoded.depth_scale_m == 0.001
     assert pixels[0, 0] == 0
     np.testing.assert_allclose(pixels[answer.valid] * 0.001, answer.depth_m[answer.valid], atol=0.00051)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (5, 1), (37, 53)])
+def test_another_reader_finds_every_level_in_the_png(size: tuple[int, int]) -> None:
+    levels = np.random.default_rng(0).integers(0, 2**16, size, np.uint16)
+    np.testing.assert_array_equal(read_png(grey_png(levels)), levels)
 
 
 def test_png_has_no_answer_beyond_what_it_can_hold_and_says_so(answer: DepthMap) -> None:
