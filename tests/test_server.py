@@ -140,3 +140,12 @@ def test_the_log_has_one_json_event_a_request(server: Server) -> None:
     assert len(events) == 1
     assert events[0]["path"] == "/cameras/{name}"
     assert (events[0]["status"], events[0]["camera"], events[0]["level"]) == (404, "nobody", "info")
+
+
+def test_who_leaves_while_sending_is_no_fault_of_ours(server: Server) -> None:
+    with server.connect() as client:
+        head = "POST /depth?camera=c HTTP/1.1\r\nHost: x\r\nX-Request-Id: leaver\r\nContent-Type: image/jpeg\r\n"
+        client.sendall(f"{head}Content-Length: 1000\r\n\r\nhalf".encode())
+        time.sleep(0.2)
+    events = server.poll(lambda: [json.loads(line) for line in server.log.splitlines() if "leaver" in line])
+    assert [(event["event"], event["status"], event["level"]) for event in events] == [("request", 499, "info")]

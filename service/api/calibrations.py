@@ -9,7 +9,6 @@ from uuid import uuid4
 from fastapi import APIRouter, Depends, FastAPI, Header, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.sse import EventSourceResponse, ServerSentEvent
-from starlette.requests import ClientDisconnect
 
 from service.api.calibration_schemas import (
     SETTINGS_FIELD,
@@ -41,7 +40,6 @@ from service.storage.calibrations import ID_PATTERN, CalibrationDraft, Calibrati
 from service.storage.spool import Spool
 
 STORE_ERRORS = (Busy, NotReady)
-CLIENT_CLOSED_REQUEST = 499
 LOOK_S = 0.2
 RETRY_AFTER_S = 30
 HEADERS = {
@@ -109,14 +107,11 @@ async def create_calibration(
     prefer: Annotated[
         str | None, Header(description=f"`wait=SECONDS`, at most {MOST_WAIT_S}: answer when it has ended")
     ] = None,
-) -> CalibrationRead | Response:
+) -> CalibrationRead:
     """Queue a calibration. It is worked on one at a time, survives a restart, and its photographs go when it ends."""
     await _require_room(calibrations, spool, settings.calibration_queue_size)
     limits = FormLimits(settings.max_calibration_images, settings.max_image_bytes, settings.max_json_bytes)
-    try:
-        record = await _received(request, camera, limits, calibrations, spool)
-    except ClientDisconnect:
-        return Response(status_code=CLIENT_CLOSED_REQUEST)
+    record = await _received(request, camera, limits, calibrations, spool)
     runner.wake()
     response.headers["Location"] = f"/calibrations/{record.id}"
     wait_s = wait_of(prefer)

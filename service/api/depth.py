@@ -7,6 +7,7 @@ from typing import Annotated, TypeVar
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect
 
 from service.api.dependencies import CamerasDep, EstimatorDep, SettingsDep, WorkerDep
 from service.api.depth_schemas import DepthQuery, DepthRead, PointRead, SpreadRead
@@ -41,7 +42,6 @@ T = TypeVar("T")
 JSON = "json"
 FORMAT_TYPES = {**MEDIA_TYPES, JSON: "application/json"}
 STAGES = ("decode", "wait", "blur", "correct", "depth", "encode")
-CLIENT_CLOSED_REQUEST = 499
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +143,7 @@ async def estimate_depth(
     order = Order(upload, record, camera, query, chosen, limits, warnings)
     outcome = await _unless_gone(request, worker.run(fulfil, order, estimator))
     if outcome is None:
-        return Response(status_code=CLIENT_CLOSED_REQUEST)
+        raise ClientDisconnect
     answer = outcome.value
     timings_ms = {**answer.timings_ms, "wait": outcome.wait_ms}
     request.app.state.metrics.time_stages(timings_ms)

@@ -372,7 +372,7 @@ def test_a_client_that_goes_away_gives_up_its_place(app: FastAPI) -> None:
     with TestClient(app) as client:
         client.post("/cameras", json=CAMERA)
         asyncio.run(scenario(app.state.worker))
-    assert sent[0]["status"] == 499
+    assert sent == []
 
 
 def test_ten_requests_leave_no_memory_behind(client: TestClient) -> None:
