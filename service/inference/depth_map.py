@@ -116,17 +116,15 @@ class Layers:
 
 def decide(readings: list[Reading], size: tuple[int, int], side: Side) -> tuple[Layers, NDArray[np.bool_]]:
     """Layers (height, width) and which pixels have an answer; the surest reading wins, pixel by pixel."""
-    first, *others = readings
-    layers, least = _told(first, size, side)
-    for reading in others:
-        told, error = _told(reading, size, side)
-        layers.take(told, error < least)
-        np.fmin(least, error, out=least)
+    layers, *others = (_told(reading, size, side) for reading in readings)
+    for told in others:
+        layers.take(told, told.sigma_m < layers.sigma_m)
+    np.multiply(layers.sigma_m, layers.depth_m, out=layers.sigma_m)
     return layers, layers.hide_unanswered()
 
 
-def _told(reading: Reading, size: tuple[int, int], side: Side) -> tuple[Layers, Array]:
-    """Layers from one reading, and the relative error of depth there.
+def _told(reading: Reading, size: tuple[int, int], side: Side) -> Layers:
+    """Layers from one reading, whose ``sigma_m`` is relative yet.
 
     The side is what the network tells unless it is given; where no far answer can exist it is near, always.
     """
@@ -139,5 +137,7 @@ def _told(reading: Reading, size: tuple[int, int], side: Side) -> tuple[Layers, 
     np.copyto(p_near, 1, where=np.isnan(far_m))
     is_near = p_near >= 0.5
     depth_m = np.where(is_near, near_m, far_m)
+    other_m = near_m
+    np.copyto(other_m, far_m, where=is_near)
     blur_px /= np.float32(reading.scale)
-    return Layers(depth_m, np.where(is_near, far_m, near_m), p_near, error * depth_m, blur_px), error
+    return Layers(depth_m, other_m, p_near, error, blur_px)
