@@ -59,7 +59,7 @@ def test_int8_answers_nearly_as_torch_and_computes_in_int8(in_int8: tuple[Pair, 
         model = onnx.load(graph)
         made = {name: node.op_type for node in model.graph.node for name in node.output}
         convolutions = [node for node in model.graph.node if node.op_type == "Conv"]
-        in_int8_inside = [node for node in convolutions if made.get(node.input[0]) == "DequantizeLinear"]
+        in_int8_inside = [node for node in convolutions if made.get(node.input[1]) == "DequantizeLinear"]
         assert len(in_int8_inside) >= 14
         assert convolutions[0] not in in_int8_inside
         assert convolutions[-1] not in in_int8_inside
