@@ -39,9 +39,9 @@ NATIVE_K_CAM_PX = 1.3  # a phone's at 12 megapixels
 THREADS = (1, 2)
 MATRIX = 1024
 CONVOLUTION = (64, 120, 160)  # channels, rows, columns
-SEED = 5
-
+FRAME_K_CAM_PX = 3.81
 FLOAT32 = "float32"
+SEED = 5
 
 K = TypeVar("K")
 Work = Callable[[], object]
@@ -88,14 +88,14 @@ def draw_picture(width_px: int, height_px: int) -> Picture:
     return np.ascontiguousarray(np.tile(tile, repeats)[:height_px, :width_px])
 
 
-def camera_for(width_px: int, height_px: int, k_cam_px: float = 3.81) -> Camera:
+def camera_for(width_px: int, height_px: int, k_cam_px: float = FRAME_K_CAM_PX) -> Camera:
     return Camera(width_px, height_px, 2.0, k_cam_px, 0.5)
 
 
 def _eager(pair: Pair, picture: Picture, layout: torch.memory_format) -> Work:
     convert_conv2d_weight_memory_format(pair.modules().eval(), layout)
     image = (torch.from_numpy(picture).permute(2, 0, 1)[None].float() / 255).contiguous(memory_format=layout)
-    gamma, k_cam = torch.tensor([0.5]), torch.tensor([3.81])
+    gamma, k_cam = torch.tensor([0.5]), torch.tensor([FRAME_K_CAM_PX])
     scene = Scene(torch.tensor([2.0]), torch.zeros(1), torch.zeros(1))
 
     def run() -> object:

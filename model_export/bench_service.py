@@ -9,12 +9,11 @@ from http import HTTPStatus
 import cv2
 import numpy as np
 
-from model_export.bench_graphs import NATIVE_K_CAM_PX, SIZE, Timing, draw_picture
+from model_export.bench_graphs import FRAME_K_CAM_PX, NATIVE_K_CAM_PX, SIZE, Timing, draw_picture
 from model_export.served import Reply, Server
 
 CLIENTS = (1, 2, 4, 8, 16)
 FULL_SIZE = (4000, 3000)
-FRAME_K_CAM_PX = 3.81
 PHOTOGRAPHS_K_CAM_PX = (NATIVE_K_CAM_PX, 50.0)
 PERCENTILES = (50, 95, 99)
 JPEG_QUALITY = 90

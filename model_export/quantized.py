@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 from numpy.typing import NDArray
-from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
+from onnxruntime.quantization import QuantFormat, QuantType, quantize_static
 from onnxruntime.quantization.shape_inference import quant_pre_process
 
 from model_export.config import SceneConfig
@@ -30,8 +30,8 @@ QUANTISED = ("Conv", "Relu", "MaxPool", "Resize", "Concat", "Add")
 Feeds = dict[str, NDArray[np.float32]]
 
 
-class _Feeds(CalibrationDataReader):  # type: ignore[misc] # its package is not typed
-    """Feeds one by one, as the quantiser asks for them."""
+class _Feeds:
+    """Feeds one by one, as the quantiser asks for them: its ``CalibrationDataReader``."""
 
     def __init__(self, feeds: list[Feeds]) -> None:
         self._feeds = iter(feeds)

@@ -1,7 +1,11 @@
-"""The service: photographs in, metres out."""
+"""The service: photographs in, metres out. Here is what libraries read once, when they are first imported."""
 
 import os
 
-# NumPy reads it when it is first imported. Huge pages for its large arrays are found by compacting memory, which stalls
-# a photograph of 12 megapixels by up to a second.
+# OpenCV's own limit lets a 600 kB file take gigabytes
+PIXEL_CEILING = 100_000_000
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(PIXEL_CEILING))
+os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")
+
+# huge pages for NumPy's arrays are found by compacting memory: a photograph of 12 megapixels stalls up to a second
 os.environ.setdefault("NUMPY_MADVISE_HUGEPAGE", "0")

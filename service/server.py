@@ -2,6 +2,7 @@
 
 import asyncio
 import socket
+from typing import cast
 
 import h11
 import uvicorn
@@ -39,8 +40,8 @@ class DeadlineProtocol(H11Protocol):
     deadline_s: float
     _clock: asyncio.TimerHandle | None = None
 
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        super().connection_made(transport)
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(cast(asyncio.Transport, transport))
         self._start_clock()
 
     def connection_lost(self, exc: Exception | None) -> None:

@@ -84,4 +84,4 @@ def test_no_folder_is_called_after_nothing() -> None:
 
 def test_the_environment_is_read_in_one_place() -> None:
     readers = [path.name for path in SERVICE if "os.environ" in path.read_text(encoding="utf-8")]
-    assert set(readers) <= {"__init__.py", "config.py", "opencv.py"}
+    assert set(readers) <= {"__init__.py", "config.py"}

@@ -7,6 +7,7 @@ import socket
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +83,7 @@ def test_what_was_acknowledged_survives_a_kill(data_dir: Path, tiny_model_dir: P
     (data_dir / GO).touch()
     with serving(data_dir, tiny_model_dir) as second:
         for revision, path in enumerate(paths, 1):
-            body = second.poll(lambda path=path: _ended(second, path))  # type: ignore[misc]
+            body = second.poll(partial(_ended, second, path))
             assert (body["state"], body["camera_revision"]) == ("succeeded", revision)
         assert second.ask("GET", "/cameras/bench").json()["revision"] == 2
         second.poll(lambda: folders(data_dir) == [])

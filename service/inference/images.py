@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service import PIXEL_CEILING
 from service.errors import InvalidImage, TooLarge, UnsupportedKind
 from service.inference.headers import Header, Kind, read_header, sniff
-from service.opencv import PIXEL_CEILING, cv2
+from service.opencv import cv2
 
 MEDIA_TYPES: dict[str, Kind] = {
     "image/jpeg": "jpeg",

@@ -11,11 +11,8 @@ from service.calibration.calibrate import Picture, Task, calibrate
 from service.calibration.plot import as_svg
 from service.calibration.report import PictureReport, Report
 from service.errors import InvalidImage
+from service.inference.cancellation import Cancelled
 from tests.simulated_sheets import CAMERA, DEPTHS_M, GRID, Shot, shots
-
-
-class Stopped(Exception):  # noqa: N818 - an outcome, not a fault
-    pass
 
 
 def pictures(taken: Sequence[Shot]) -> list[Picture]:
@@ -131,9 +128,9 @@ def test_it_tells_how_far_it_is_and_can_be_stopped(taken: list[Shot]) -> None:
         nonlocal calls
         calls += 1
         if calls > 100:
-            raise Stopped
+            raise Cancelled
 
-    with pytest.raises(Stopped):
+    with pytest.raises(Cancelled):
         calibrate(Task(GRID), pictures(taken), tell=lambda done, seen: told.append((done, seen)), check=check)
     assert told[0] == (0.0, ())
     assert all(0 <= done <= 1 for done, _ in told)

@@ -23,8 +23,8 @@ def untrained(kind: Kind) -> Pair:
     pair = make_pair(kind)
     for module in pair.modules().modules():
         if isinstance(module, torch.nn.BatchNorm2d):  # as training leaves them: neither 0 nor 1
-            torch.nn.init.uniform_(module.running_mean, -0.1, 0.1)  # type: ignore[arg-type]
-            torch.nn.init.uniform_(module.running_var, 0.5, 1.5)  # type: ignore[arg-type]
+            module.get_buffer("running_mean").uniform_(-0.1, 0.1)
+            module.get_buffer("running_var").uniform_(0.5, 1.5)
     return pair
 
 

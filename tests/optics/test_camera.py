@@ -1,6 +1,7 @@
 """The camera: bounds, resizing, refocusing."""
 
 import math
+from typing import Any
 
 import pytest
 
@@ -10,8 +11,8 @@ D200 = Lens(focal_length_mm=35, f_number=2.8, pixel_pitch_um=6.05, sensor_width_
 
 
 def camera(**changes: float) -> Camera:
-    values = {"image_width_px": 640, "image_height_px": 480, "focus_distance_m": 2.0, "k_cam_px": 3.81} | changes
-    return Camera(**values)  # type: ignore[arg-type]
+    values: dict[str, Any] = {"image_width_px": 640, "image_height_px": 480, "focus_distance_m": 2.0, "k_cam_px": 3.81}
+    return Camera(**(values | changes))
 
 
 def test_lens_specs_give_k_cam_at_the_images_width() -> None:
