@@ -8,6 +8,7 @@ from importlib.metadata import version
 from fastapi import FastAPI
 from fastapi_offline import FastAPIOffline
 
+from service.access import Authenticate
 from service.api import calibrations, cameras, depth, handlers, health, metrics, model, openapi, pages, target
 from service.calibration.calibrate import calibrate
 from service.config import Settings
@@ -19,8 +20,8 @@ from service.middleware import AnswerHead, BodyLimits, LimitRequests, ObserveReq
 from service.runner import Calibrate, Runner
 from service.storage import schema
 from service.storage.calibrations import Calibrations
-from service.storage.cameras import Cameras
 from service.storage.engine import open_engine
+from service.storage.keys import Keys
 from service.storage.spool import Spool
 
 DEPTH_PATH = "/depth"
@@ -73,6 +74,7 @@ def _add_middleware(app: FastAPI, settings: Settings) -> None:
             CALIBRATE_PATH: BodyLimits(settings.max_calibration_bytes, settings.calibration_receive_deadline_s),
         },
     )
+    app.add_middleware(Authenticate, is_on=settings.wants_keys, requests_per_minute=settings.key_requests_per_minute)
     app.add_middleware(AnswerHead)
     app.add_middleware(ObserveRequests, metrics=app.state.metrics)
 
@@ -95,16 +97,15 @@ def _start(app: FastAPI) -> None:
     estimator = Estimator.from_folder(folder, intra_op_threads=settings.threads_per_worker)
     estimator.warm_up()
     app.state.engine = engine
-    app.state.cameras = Cameras(engine)
+    app.state.keys = Keys(engine)
     app.state.model = folder
     app.state.estimator = estimator
     app.state.worker = Worker(
         slots=settings.worker_slots, queue_size=settings.queue_size, deadline_s=settings.deadline_s
     )
-    app.state.calibrations = Calibrations(engine)
     app.state.spool = Spool(settings.spool_dir)
     app.state.runner = Runner(
-        app.state.calibrations,
+        Calibrations(engine),
         app.state.spool,
         ImageLimits(settings.max_image_bytes, settings.max_image_pixels),
         app.state.calibrate,

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
 from importlib.metadata import EntryPoint, entry_points, version
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,6 +14,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from service.config import Settings, SettingsError, load_settings
 from service.errors import CamindError
+from service.principal import EVERYDAY, LOCAL, SCOPES
 
 GROUP = "camind.commands"
 WRONG_USE = 2
@@ -25,13 +27,16 @@ app = typer.Typer(
 )
 cameras_app = typer.Typer(help="The cameras in the database.", no_args_is_help=True)
 app.add_typer(cameras_app, name="cameras")
+keys_app = typer.Typer(help="The API keys: who may use the service.", no_args_is_help=True)
+app.add_typer(keys_app, name="keys")
+OWNER_HELP = "Whose they are. [default: whoever uses the service without a key]"
 
 
 def main() -> None:
     """Run the command line; other packages' commands are loaded only where one may be meant."""
     own = {command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands}
     wanted = sys.argv[1] if len(sys.argv) > 1 else "--help"
-    if wanted not in own | {"cameras"}:
+    if wanted not in own | {"cameras", "keys"}:
         for entry_point in entry_points(group=GROUP):
             _add_commands(entry_point)
     app()
@@ -55,8 +60,10 @@ def serve(
         load_model_folder(settings.served_model_dir)
         if settings.is_database_embedded:
             _migrated(settings).dispose()
+        if settings.wants_keys:
+            _require_key(settings)
     typer.echo(f"camind on http://{settings.host}:{listener.getsockname()[1]}", err=True)
-    if not settings.is_loopback:
+    if not (settings.is_loopback or settings.wants_keys):
         typer.echo("Other machines can reach it, and it asks nobody who they are.", err=True)
     if not server.serve(create_app(settings), settings, listener):
         raise _failure("camind did not start: the log above says why.")
@@ -124,6 +131,7 @@ def calibrate(
         "calibration.json"
     ),
     register: Annotated[str | None, typer.Option(help="Camera to store, or to give a new revision")] = None,
+    owner: Annotated[str, typer.Option(help=OWNER_HELP)] = LOCAL,
 ) -> None:
     """Photographs of the sheet to a camera's k_cam, gamma, focus distance and intrinsics."""
     from service.calibration.calibrate import Task
@@ -146,7 +154,7 @@ def calibrate(
         from service.storage.cameras import Cameras
 
         with _plain_failures():
-            record = Cameras(_ready_engine()).store_calibrated(register, report.result.to_camera())
+            record = Cameras(_ready_engine(), owner).store_calibrated(register, report.result.to_camera())
         typer.echo(f"stored as {record.name}, revision {record.revision}")
 
 
@@ -157,18 +165,18 @@ def print_version() -> None:
 
 
 @cameras_app.command(name="seed")
-def seed_cameras() -> None:
+def seed_cameras(owner: Annotated[str, typer.Option(help=OWNER_HELP)] = LOCAL) -> None:
     """Store the cameras of the paper's Table 1; names already there are left as they are."""
     from service.storage.cameras import Cameras
     from service.storage.seeds import seed
 
     with _plain_failures():
-        names = seed(Cameras(_ready_engine()))
+        names = seed(Cameras(_ready_engine(), owner))
     typer.echo("\n".join(names) if names else "Every seed is there already.")
 
 
 @cameras_app.command(name="list")
-def list_cameras() -> None:
+def list_cameras(owner: Annotated[str, typer.Option(help=OWNER_HELP)] = LOCAL) -> None:
     """Print name, revision, k_cam, focus distance and image size, a camera a line."""
     from service.storage.cameras import CameraRecord, Cameras
 
@@ -178,7 +186,7 @@ def list_cameras() -> None:
         return f"{record.name}\tr{record.revision}\t{camera.k_cam_px:.4g} px\t{camera.focus_distance_m:g} m\t{size}"
 
     with _plain_failures():
-        cameras, after, has_more = Cameras(_ready_engine()), None, True
+        cameras, after, has_more = Cameras(_ready_engine(), owner), None, True
         while has_more:
             records, has_more = cameras.page(100, after)
             for record in records:
@@ -186,11 +194,80 @@ def list_cameras() -> None:
             after = records[-1].name if records else None
 
 
+@keys_app.command(name="create")
+def create_key(
+    name: Annotated[str, typer.Argument(help="What to call it")],
+    scope: Annotated[
+        list[str] | None, typer.Option(help=f"May be repeated: {', '.join(SCOPES)}. [default: all but admin]")
+    ] = None,
+    owner: Annotated[
+        str | None, typer.Option(help="Whose cameras and calibrations it works with. [default: its name]")
+    ] = None,
+    days: Annotated[float | None, typer.Option(help="How long it is good. [default: for ever]", min=0.0)] = None,
+) -> None:
+    """Make an API key and print it: it is not stored and cannot be shown again."""
+    from service.storage.keys import Keys
+
+    scopes = [known for known in SCOPES if known in (scope or EVERYDAY)]
+    unknown = sorted(set(scope or ()) - set(scopes))
+    if unknown:
+        raise _failure(f"There is no scope {', '.join(unknown)}: take {', '.join(SCOPES)}.", WRONG_USE)
+    expires_at = None if days is None else datetime.now(UTC) + timedelta(days=days)
+    with _plain_failures():
+        key, text = Keys(_ready_engine()).create(name, owner or name, scopes, expires_at)
+    until = f"until {key.expires_at:%Y-%m-%d %H:%M} UTC" if key.expires_at else "until it is revoked"
+    typer.echo(f"Key {key.id} for {key.owner}: {', '.join(scopes)}; good {until}. It is shown this once:", err=True)
+    typer.echo(text)
+
+
+@keys_app.command(name="list")
+def list_keys() -> None:
+    """Print id, name, owner, scopes, state, expiry and last use, a key a line."""
+    from service.storage.keys import ApiKey, Keys
+
+    now = datetime.now(UTC)
+
+    def moment(time: datetime | None) -> str:
+        return f"{time:%Y-%m-%d %H:%M}" if time else "never"
+
+    def line(key: ApiKey) -> str:
+        state = "good" if key.is_good(now) else "revoked" if key.revoked_at else "expired"
+        scopes = ",".join(scope for scope in SCOPES if scope in key.scopes)
+        dates = f"expires {moment(key.expires_at)}\tused {moment(key.last_used_at)}"
+        return f"{key.id}\t{key.name}\t{key.owner}\t{scopes}\t{state}\t{dates}"
+
+    with _plain_failures():
+        for key in Keys(_ready_engine()).every():
+            typer.echo(line(key))
+
+
+@keys_app.command(name="revoke")
+def revoke_key(key_id: Annotated[str, typer.Argument(help="As `camind keys list` shows it")]) -> None:
+    """Refuse a key from now on; what it made stays with its owner."""
+    from service.storage.keys import Keys
+
+    with _plain_failures():
+        key = Keys(_ready_engine()).revoke(key_id)
+    typer.echo(f"Key {key.id} ({key.name}) is refused from now on.")
+
+
 def _settings(**overrides: object) -> Settings:
     try:
         return load_settings(**overrides)
     except SettingsError as exc:
         raise _failure(str(exc), WRONG_USE) from exc
+
+
+def _require_key(settings: Settings) -> None:
+    from service.storage.engine import open_engine
+    from service.storage.keys import Keys
+
+    if not Keys(open_engine(settings.effective_database_url)).has_good():
+        raise _failure(
+            f"Requests to {settings.host} need an API key, and there is none: make one with `camind keys create NAME`, "
+            "or set CAMIND_API_KEYS=off to let everybody in.",
+            WRONG_USE,
+        )
 
 
 def _migrated(settings: Settings) -> Engine:

@@ -52,6 +52,14 @@ class Settings(BaseSettings):
     host: Annotated[str, Field(min_length=1, description="Address to bind; default: this machine only")] = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535, description="TCP port; 0 lets the system choose")] = 8000
 
+    api_keys: Annotated[
+        Literal["auto", "on", "off"],
+        Field(description="Whether requests need an API key; auto: unless only this machine can reach the service"),
+    ] = "auto"
+    key_requests_per_minute: Annotated[
+        int, Field(ge=0, le=1_000_000, description="Requests of one API key in a minute; 0: no quota")
+    ] = 600
+
     workers: Annotated[int, Field(ge=0, le=64, description="Images worked on at a time; 0: cores / 2")] = 0
     intra_op_threads: Annotated[int, Field(ge=0, le=64, description="Threads per image; 0: cores / workers")] = 0
     queue_size: Annotated[int, Field(ge=0, le=1000, description="Images that may wait for a worker")] = 16
@@ -131,6 +139,11 @@ class Settings(BaseSettings):
     def is_database_embedded(self) -> bool:
         """Whether the database is ours alone, and ``camind serve`` may migrate it."""
         return self.effective_database_url.startswith("sqlite")
+
+    @property
+    def wants_keys(self) -> bool:
+        """Whether a request needs an API key."""
+        return self.api_keys == "on" or (self.api_keys == "auto" and not self.is_loopback)
 
     @property
     def is_loopback(self) -> bool:

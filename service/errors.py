@@ -3,7 +3,10 @@
 CamindError
 ├── BadRequest (422)           what was sent cannot be used
 │   ├── InvalidImage           the bytes are no whole image
-│   └── ImageSizeMismatch      not the camera's frame
+│   ├── ImageSizeMismatch      not the camera's frame
+│   └── KeyReused              an Idempotency-Key that came with another request
+├── Unauthorized (401)         no API key, or none that is good
+├── Forbidden (403)            the API key lacks a scope
 ├── NotFound (404)
 ├── MethodNotAllowed (405)     the path exists, the method does not
 ├── ReceiveTimeout (408)       the request came too slowly
@@ -12,6 +15,7 @@ CamindError
 ├── TooLarge (413)             too many bytes or pixels
 ├── UnsupportedKind (415)      a media type or file kind that is not listed
 ├── NotAcceptable (406)        no representation fits Accept
+├── QuotaExceeded (429)        the API key asked too often
 ├── Busy (503)                 the queue is full, or the deadline passed
 └── NotReady (503)             a part of the service is not up
 
@@ -63,6 +67,35 @@ class InvalidImage(BadRequest):
 class ImageSizeMismatch(BadRequest):
     code = "image-size-mismatch"
     title = "Image is not the camera's frame"
+
+
+class KeyReused(BadRequest):
+    code = "idempotency-key-reused"
+    title = "Idempotency-Key was used before"
+
+
+class Unauthorized(CamindError):
+    status = 401
+    code = "unauthorized"
+    title = "API key needed"
+
+    @property
+    def headers(self) -> dict[str, str]:
+        return {"WWW-Authenticate": "Bearer"}
+
+
+class Forbidden(CamindError):
+    status = 403
+    code = "forbidden"
+    title = "API key lacks a scope"
+
+    def __init__(self, detail: str, *, scope: str) -> None:
+        super().__init__(detail)
+        self.scope = scope
+
+    @property
+    def headers(self) -> dict[str, str]:
+        return {"WWW-Authenticate": f'Bearer error="insufficient_scope", scope="{self.scope}"'}
 
 
 class NotFound(CamindError):
@@ -121,10 +154,8 @@ class NotAcceptable(CamindError):
     title = "Not acceptable"
 
 
-class Busy(CamindError):
-    status = 503
-    code = "busy"
-    title = "Busy"
+class _Wait(CamindError):
+    """One that says when to try again."""
 
     def __init__(self, detail: str, *, retry_after_s: int = 1) -> None:
         super().__init__(detail)
@@ -133,6 +164,18 @@ class Busy(CamindError):
     @property
     def headers(self) -> dict[str, str]:
         return {"Retry-After": str(self.retry_after_s)}
+
+
+class QuotaExceeded(_Wait):
+    status = 429
+    code = "quota-exceeded"
+    title = "Quota exceeded"
+
+
+class Busy(_Wait):
+    status = 503
+    code = "busy"
+    title = "Busy"
 
 
 class NotReady(CamindError):

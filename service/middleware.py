@@ -1,6 +1,6 @@
 """Around every request, in pure ASGI: an id, one log event, metrics, limits on what is received, HEAD.
 
-From the outside in: ``ObserveRequests``, ``AnswerHead``, ``LimitRequests``, then the routes.
+From the outside in: ``ObserveRequests``, ``AnswerHead``, ``access.Authenticate``, ``LimitRequests``, then the routes.
 """
 
 import asyncio
@@ -91,6 +91,7 @@ class ObserveRequests:
             status=status,
             duration_ms=round(duration_s * 1e3, 1),
             **_camera(scope, path),
+            **_key(scope),
         )
 
 
@@ -195,8 +196,14 @@ def _camera(scope: Scope, path: str | None) -> dict[str, str]:
     return {"camera": names[0][:64]} if names else {}
 
 
+def _key(scope: Scope) -> dict[str, str]:
+    """The API key a request came with, by its public half, for the log."""
+    principal = scope.get("state", {}).get("principal")
+    return {"key": principal.key_id} if principal and principal.key_id else {}
+
+
 def _hand_back(inner: MutableMapping[str, object], scope: Scope) -> None:
     """Let the outer middleware see which route answered."""
-    for key in ("route", "path_params"):
+    for key in ("route", "path_params", "state"):
         if key in inner:
             scope[key] = inner[key]

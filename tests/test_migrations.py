@@ -2,14 +2,17 @@
 
 import re
 from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
 from pathlib import Path
 
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
-from sqlalchemy import Engine, inspect
+from sqlalchemy import Engine, inspect, text
 
 import migrations
+from service.optics.camera import Camera
 from service.storage import schema
+from service.storage.cameras import CameraDraft, Cameras
 from service.storage.tables import metadata
 
 VERSIONS = Path(migrations.__file__).parent / "versions"
@@ -60,6 +63,30 @@ def test_foreign_keys_hold_again_after_migrating(engine: Engine) -> None:
     if engine.dialect.name == "sqlite":
         with engine.connect() as connection:
             assert connection.exec_driver_sql("PRAGMA foreign_keys").scalar() == 1
+
+
+def test_what_was_there_before_owners_is_local_and_stays(empty_engine: Engine) -> None:
+    schema.upgrade(empty_engine, "2026_11_22_calibrations")
+    now = datetime.now(UTC)
+    with empty_engine.begin() as connection:
+        for name in ("here", "gone"):
+            row = {"name": name, "now": now, "gone": now if name == "gone" else None}
+            words = "INSERT INTO cameras (name, revision, created_at, updated_at, deleted_at)"
+            connection.execute(text(f"{words} VALUES (:name, 3, :now, :now, :gone)"), row)
+    schema.upgrade(empty_engine)
+    with empty_engine.connect() as connection:
+        rows = connection.exec_driver_sql("SELECT owner, name, revision FROM cameras ORDER BY id").all()
+    assert [tuple(row) for row in rows] == [("local", "here", 3), ("local", "gone", 3)]
+
+
+def test_the_way_back_keeps_what_was_made_without_keys(engine: Engine) -> None:
+    draft = CameraDraft("bench", Camera(640, 480, 1.5, 3.81), "given")
+    for owner in ("local", "lab"):
+        Cameras(engine, owner).add(draft)
+    schema.downgrade(engine, "2026_11_22_calibrations")
+    schema.upgrade(engine)
+    assert Cameras(engine).get("bench").draft == draft
+    assert Cameras(engine, "lab").page(1) == ([], False)
 
 
 def test_migrations_are_named_by_date() -> None:

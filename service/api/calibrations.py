@@ -1,7 +1,9 @@
 """``POST /calibrate`` and ``/calibrations``: photographs of the printed grid in, a camera's constants out."""
 
 import asyncio
-from collections.abc import AsyncIterator
+import hashlib
+import json
+from collections.abc import AsyncIterator, Iterator
 from contextlib import suppress
 from typing import Annotated
 from uuid import uuid4
@@ -19,7 +21,7 @@ from service.api.calibration_schemas import (
 )
 from service.api.calibration_uploads import DEFOCUSED, FOCUSED, FormLimits, receive_form
 from service.api.cursors import cursor_after, name_of
-from service.api.dependencies import CalibrationsDep, RunnerDep, SettingsDep, SpoolDep
+from service.api.dependencies import CalibrationsDep, IdempotencyKey, RunnerDep, SettingsDep, SpoolDep
 from service.api.openapi import REF
 from service.api.preferences import MOST_WAIT_S, wait_of
 from service.api.problems import responses
@@ -30,6 +32,7 @@ from service.errors import (
     Busy,
     Conflict,
     InvalidImage,
+    KeyReused,
     NotFound,
     NotReady,
     TooLarge,
@@ -37,6 +40,7 @@ from service.errors import (
 )
 from service.runner import RESULT
 from service.storage.calibrations import ID_PATTERN, CalibrationDraft, CalibrationRecord, Calibrations
+from service.storage.idempotency import once_of
 from service.storage.spool import Spool
 
 STORE_ERRORS = (Busy, NotReady)
@@ -73,7 +77,7 @@ FoundDep = Annotated[CalibrationRecord, Depends(_find)]
     responses={
         200: {"model": CalibrationRead, "description": "It ended within the wait", "headers": HEADERS},
         202: {"description": "It is queued", "headers": HEADERS},
-        **responses(BadRequest, InvalidImage, TooLarge, UnsupportedKind, *STORE_ERRORS),
+        **responses(BadRequest, InvalidImage, KeyReused, TooLarge, UnsupportedKind, *STORE_ERRORS),
     },
     openapi_extra={
         "requestBody": {
@@ -107,11 +111,12 @@ async def create_calibration(
     prefer: Annotated[
         str | None, Header(description=f"`wait=SECONDS`, at most {MOST_WAIT_S}: answer when it has ended")
     ] = None,
+    idempotency_key: IdempotencyKey = None,
 ) -> CalibrationRead:
     """Queue a calibration. It is worked on one at a time, survives a restart, and its photographs go when it ends."""
     await _require_room(calibrations, spool, settings.calibration_queue_size)
     limits = FormLimits(settings.max_calibration_images, settings.max_image_bytes, settings.max_json_bytes)
-    record = await _received(request, camera, limits, calibrations, spool)
+    record = await _received(request, camera, limits, calibrations, spool, idempotency_key)
     runner.wake()
     response.headers["Location"] = f"/calibrations/{record.id}"
     wait_s = wait_of(prefer)
@@ -206,7 +211,12 @@ async def _require_room(calibrations: Calibrations, spool: Spool, queue_size: in
 
 
 async def _received(
-    request: Request, camera: str, limits: FormLimits, calibrations: Calibrations, spool: Spool
+    request: Request,
+    camera: str,
+    limits: FormLimits,
+    calibrations: Calibrations,
+    spool: Spool,
+    idempotency_key: str | None,
 ) -> CalibrationRecord:
     """The calibration in a request's form, with its photographs on the disk and its row in the database."""
     calibration_id = uuid4().hex
@@ -214,12 +224,26 @@ async def _received(
         form = await receive_form(request, folder, limits)
         wanted = CalibrationSettings.from_form(form.settings)
         draft = CalibrationDraft(calibration_id, spool.id, camera, wanted.model_dump(mode="json"), form.pictures)
-        return await run_in_threadpool(_store, calibrations, spool, draft)
+        return await run_in_threadpool(_store, calibrations, spool, draft, idempotency_key)
 
 
-def _store(calibrations: Calibrations, spool: Spool, draft: CalibrationDraft) -> CalibrationRecord:
+def _store(
+    calibrations: Calibrations, spool: Spool, draft: CalibrationDraft, idempotency_key: str | None
+) -> CalibrationRecord:
     spool.seal(draft.id)
-    return calibrations.add(draft)
+    record = calibrations.add(draft, once_of(idempotency_key, _parts(draft, spool)))
+    if record.id != draft.id:  # the request was done before, and these are its photographs once more
+        spool.remove(draft.id)
+    return record
+
+
+def _parts(draft: CalibrationDraft, spool: Spool) -> Iterator[bytes]:
+    """All that makes a request for a calibration what it is."""
+    yield json.dumps([draft.camera, draft.settings]).encode()
+    for picture, path in zip(draft.pictures, spool.paths(draft.id, len(draft.pictures)), strict=True):
+        yield f"{picture.role} {picture.name}".encode()
+        with path.open("rb") as file:
+            yield hashlib.file_digest(file, "sha256").digest()
 
 
 async def _changes(

@@ -6,7 +6,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Header, Query, Response
 
 from service.api.cursors import cursor_after, name_of
-from service.api.dependencies import CamerasDep, require_json
+from service.api.dependencies import CamerasDep, IdempotencyKey, require_json
 from service.api.problems import responses
 from service.api.schemas import (
     CameraCreate,
@@ -21,6 +21,7 @@ from service.errors import (
     Busy,
     Conflict,
     FieldProblem,
+    KeyReused,
     NotFound,
     NotReady,
     PreconditionFailed,
@@ -29,6 +30,7 @@ from service.errors import (
 from service.optics import thin_lens
 from service.optics.camera import RANGE_BLUR_ERROR_PX, Camera
 from service.storage.cameras import CameraRecord
+from service.storage.idempotency import once_of
 
 BODY_ERRORS = (BadRequest, UnsupportedKind)
 STORE_ERRORS = (Busy, NotReady)
@@ -50,11 +52,17 @@ Depth = Annotated[float | None, Query(ge=0.001, le=100_000, allow_inf_nan=False,
     status_code=201,
     summary="Register a camera",
     dependencies=[Depends(require_json)],
-    responses={201: {"headers": {**LOCATION, **ETAG}}, **responses(Conflict, *BODY_ERRORS, *STORE_ERRORS)},
+    responses={
+        201: {"headers": {**LOCATION, **ETAG}},
+        **responses(Conflict, *BODY_ERRORS, KeyReused, *STORE_ERRORS),
+    },
 )
-def create_camera(body: CameraCreate, cameras: CamerasDep, response: Response) -> CameraRead:
+def create_camera(
+    body: CameraCreate, cameras: CamerasDep, response: Response, idempotency_key: IdempotencyKey = None
+) -> CameraRead:
     """Register a camera from its k_cam or from its lens specs; no training is needed."""
-    record = cameras.add(body.to_draft(body.name))
+    once = once_of(idempotency_key, [b"POST /cameras", body.model_dump_json().encode()])
+    record = cameras.add(body.to_draft(body.name), once)
     response.headers["Location"] = f"/cameras/{record.name}"
     return _answer(record, response)
 

@@ -5,7 +5,7 @@ All are coroutines, though they wait for nothing: FastAPI gives each plain funct
 
 from typing import Annotated
 
-from fastapi import Depends, Request
+from fastapi import Depends, Header, Request
 
 from service.api.metrics import Metrics
 from service.config import Settings
@@ -13,6 +13,7 @@ from service.errors import UnsupportedKind
 from service.inference.artifact import ModelFolder
 from service.inference.estimator import Estimator
 from service.inference.worker import Worker
+from service.principal import Principal
 from service.runner import Runner
 from service.storage.calibrations import Calibrations
 from service.storage.cameras import Cameras
@@ -24,9 +25,13 @@ async def get_settings(request: Request) -> Settings:
     return settings
 
 
-async def get_cameras(request: Request) -> Cameras:
-    cameras: Cameras = request.app.state.cameras
-    return cameras
+async def get_owner(request: Request) -> str:
+    principal: Principal = request.state.principal
+    return principal.owner
+
+
+async def get_cameras(request: Request, owner: Annotated[str, Depends(get_owner)]) -> Cameras:
+    return Cameras(request.app.state.engine, owner)
 
 
 async def get_model(request: Request) -> ModelFolder:
@@ -44,9 +49,8 @@ async def get_worker(request: Request) -> Worker:
     return worker
 
 
-async def get_calibrations(request: Request) -> Calibrations:
-    calibrations: Calibrations = request.app.state.calibrations
-    return calibrations
+async def get_calibrations(request: Request, owner: Annotated[str, Depends(get_owner)]) -> Calibrations:
+    return Calibrations(request.app.state.engine, owner)
 
 
 async def get_spool(request: Request) -> Spool:
@@ -72,6 +76,15 @@ async def require_json(request: Request) -> None:
         raise UnsupportedKind(f"Send application/json, not {kind or 'a body without Content-Type'}.")
 
 
+IdempotencyKey = Annotated[
+    str | None,
+    Header(
+        min_length=1,
+        max_length=255,
+        pattern=r"^[!-~]+$",
+        description="Any text, new for every new request: the same request sent again with it is done once (for a day)",
+    ),
+]
 SettingsDep = Annotated[Settings, Depends(get_settings)]
 CamerasDep = Annotated[Cameras, Depends(get_cameras)]
 ModelDep = Annotated[ModelFolder, Depends(get_model)]

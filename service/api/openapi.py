@@ -8,14 +8,22 @@ from typing import Any
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
+from service.access import is_public, needed_scope
 from service.api.problems import Problem, responses
-from service.errors import ReceiveTimeout, TooLarge
+from service.errors import Forbidden, QuotaExceeded, ReceiveTimeout, TooLarge, Unauthorized
 
 # words that YAML reads as truth values or nothing
 YAML_WORDS = frozenset({"null", "true", "false", "yes", "no", "on", "off", "y", "n"})
 REF = "#/components/schemas/{model}"
 # what the limits in front of the routes answer
 BODY_ERRORS = (ReceiveTimeout, TooLarge)
+KEY_ERRORS = (Unauthorized, QuotaExceeded)
+API_KEY = "apiKey"
+SECURITY = {
+    "type": "http",
+    "scheme": "bearer",
+    "description": "An API key from `camind keys create`; not asked for where only the own machine reaches the service",
+}
 FRAMEWORK_SCHEMAS = ("HTTPValidationError", "ValidationError")
 REQUEST_ID_REF = {"$ref": "#/components/headers/RequestId"}
 REQUEST_ID = {
@@ -37,8 +45,10 @@ def describe(app: FastAPI) -> dict[str, Any]:
             license_info=app.license_info,
         )
         _add_components(document)
-        for operations in document["paths"].values():
-            for operation in operations.values():
+        for path, operations in document["paths"].items():
+            for method, operation in operations.items():
+                if not is_public(path):
+                    _secure(operation, needed_scope(method.upper(), path))
                 _complete(operation)
         app.openapi_schema = document
     return app.openapi_schema
@@ -53,6 +63,7 @@ def _add_components(document: dict[str, Any]) -> None:
     schemas.update(problem.pop("$defs", {}))
     schemas["Problem"] = problem
     components["headers"] = {"RequestId": REQUEST_ID}
+    components["securitySchemes"] = {API_KEY: SECURITY}
 
 
 def _complete(operation: dict[str, Any]) -> None:
@@ -64,6 +75,13 @@ def _complete(operation: dict[str, Any]) -> None:
             operation["responses"].setdefault(str(status), answer)
     for answer in operation["responses"].values():
         answer.setdefault("headers", {})["X-Request-Id"] = REQUEST_ID_REF
+
+
+def _secure(operation: dict[str, Any], scope: str | None) -> None:
+    """Say that a key is asked for, or none (``{}``), which scope it needs, and what happens without."""
+    operation["security"] = [{API_KEY: [scope] if scope else []}, {}]
+    for status, answer in responses(*KEY_ERRORS, *([Forbidden] if scope else [])).items():
+        operation["responses"].setdefault(str(status), answer)
 
 
 def to_yaml(document: object) -> str:

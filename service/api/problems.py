@@ -66,6 +66,13 @@ EXAMPLES: dict[str, tuple[str, tuple[FieldProblem, ...]]] = {
         "The image is 640 x 480 and camera 'd200' is 645 x 432: send the whole frame, resized at most.",
         (),
     ),
+    "idempotency-key-reused": (
+        "This Idempotency-Key came with another request before: send a new key with a new request.",
+        (),
+    ),
+    "unauthorized": ("This API key is unknown, revoked or expired.", ()),
+    "forbidden": ("This API key lacks the scope depth.", ()),
+    "quota-exceeded": ("This API key has had its 600 requests of this minute.", ()),
     "not-found": ("There is no camera 'd200'.", ()),
     "conflict": ("A camera 'd200' exists already: replace it with PUT /cameras/d200.", ()),
     "precondition-failed": ("Camera 'd200' is at revision 3: read it again, then repeat.", ()),
@@ -98,8 +105,10 @@ def _empty_entry(error: type[CamindError]) -> dict[str, Any]:
         "description": error.title,
         "content": {PROBLEM_TYPE: {"schema": schema, "examples": {}}},
     }
-    if error.status == 503:
+    if error.status in (429, 503):
         entry["headers"] = {"Retry-After": {"description": "Seconds to wait", "schema": {"type": "integer"}}}
+    if error.status in (401, 403):
+        entry["headers"] = {"WWW-Authenticate": {"description": "What is asked for", "schema": {"type": "string"}}}
     return entry
 
 

@@ -17,8 +17,10 @@ from sqlmodel import Session, col, select
 
 from service.errors import NotFound
 from service.optics.camera import Camera
+from service.principal import LOCAL
 from service.storage.cameras import store_calibrated
 from service.storage.engine import reading, writing
+from service.storage.idempotency import Once, note, outcome_of
 from service.storage.tables import CalibrationRow
 
 State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
@@ -100,37 +102,30 @@ class Ending:
 
 
 class Calibrations:
-    """The calibrations of one database; safe to share between threads."""
+    """The calibrations of one database, or one owner's; safe to share between threads.
 
-    def __init__(self, engine: Engine) -> None:
+    What a client asks is asked of one owner's; another owner's are as if not there.
+    """
+
+    def __init__(self, engine: Engine, owner: str | None = None) -> None:
         self._engine = engine
+        self._owner = owner
 
-    def add(self, draft: CalibrationDraft) -> CalibrationRecord:
-        """Queue a calibration."""
-        now = datetime.now(UTC)
-        row = CalibrationRow(
-            id=draft.id,
-            spool=draft.spool,
-            camera=draft.camera,
-            state="queued",
-            attempts=0,
-            version=1,
-            progress=0.0,
-            created_at=now,
-            updated_at=now,
-            settings=draft.settings,
-            pictures=[{"name": picture.name, "role": picture.role} for picture in draft.pictures],
-            images=[],
-        )
-        with writing(self._engine) as session:
-            session.add(row)
-            session.flush()
-            return _to_record(row)
+    def add(self, draft: CalibrationDraft, once: Once | None = None) -> CalibrationRecord:
+        """Queue a calibration; with ``once``, the one that the same request queued before.
+
+        Raises ``KeyReused`` where ``once`` came with another request.
+        """
+        try:
+            return self._add(draft, once)
+        except IntegrityError:
+            # the same request, sent twice at once to two processes: the other one's is there now
+            return self._add(draft, once)
 
     def get(self, calibration_id: str) -> CalibrationRecord:
         """The calibration as it is now. Raises ``NotFound``."""
         with reading(self._engine) as session:
-            return _to_record(_require_row(session, calibration_id))
+            return _to_record(_require_row(session, calibration_id, self._owner))
 
     def version(self, calibration_id: str) -> int:
         """A number that grows with every change, far cheaper to read than the whole; 0 for one that is not there."""
@@ -142,6 +137,8 @@ class Calibrations:
         """Up to ``limit`` calibrations, the newest first, from the one behind ``after``; and whether there are more."""
         columns = [getattr(CalibrationRow, field.name) for field in fields(CalibrationSummary)]
         query = select(*columns).order_by(col(CalibrationRow.number).desc()).limit(limit + 1)
+        if self._owner is not None:
+            query = query.where(col(CalibrationRow.owner) == self._owner)
         if after is not None:
             mark = select(CalibrationRow.number).where(col(CalibrationRow.id) == after).scalar_subquery()
             query = query.where(col(CalibrationRow.number) < mark)
@@ -188,7 +185,7 @@ class Calibrations:
     def tell(self, calibration_id: str, progress: float, images: JsonValue) -> bool:
         """Note how far a running calibration is; whether it still runs."""
         with writing(self._engine) as session:
-            row = _require_row(session, calibration_id, lock=True)
+            row = _require_row(session, calibration_id, self._owner, lock=True)
             if row.state != "running":
                 return False
             row.progress, row.images = min(max(progress, 0.0), 1.0), images
@@ -204,7 +201,7 @@ class Calibrations:
     def put_back(self, calibration_id: str) -> bool:
         """Queue a running calibration again, as if it had not been tried; whether it was running."""
         with writing(self._engine) as session:
-            row = _require_row(session, calibration_id, lock=True)
+            row = _require_row(session, calibration_id, self._owner, lock=True)
             if row.state != "running":
                 return False
             row.state, row.attempts = "queued", row.attempts - 1
@@ -223,7 +220,7 @@ class Calibrations:
     def cancel(self, calibration_id: str) -> State:
         """Cancel what has not ended; the state before. Raises ``NotFound``."""
         with writing(self._engine) as session:
-            row = _require_row(session, calibration_id, lock=True)
+            row = _require_row(session, calibration_id, self._owner, lock=True)
             before = _to_state(row.state)
             if before in LIVE:
                 row.state = "cancelled"
@@ -256,13 +253,40 @@ class Calibrations:
             session.connection().execute(again)
             session.connection().execute(given_up)
 
+    def _add(self, draft: CalibrationDraft, once: Once | None) -> CalibrationRecord:
+        now, owner = datetime.now(UTC), self._owner or LOCAL
+        row = CalibrationRow(
+            id=draft.id,
+            owner=owner,
+            spool=draft.spool,
+            camera=draft.camera,
+            state="queued",
+            attempts=0,
+            version=1,
+            progress=0.0,
+            created_at=now,
+            updated_at=now,
+            settings=draft.settings,
+            pictures=[{"name": picture.name, "role": picture.role} for picture in draft.pictures],
+            images=[],
+        )
+        with writing(self._engine) as session:
+            earlier = outcome_of(session, owner, once) if once else None
+            if earlier is not None:
+                return _to_record(_require_row(session, earlier, self._owner))
+            session.add(row)
+            session.flush()
+            if once:
+                note(session, owner, once, row.id)
+            return _to_record(row)
+
     def _finish(self, calibration_id: str, ending: Ending) -> bool:
         with writing(self._engine) as session:
-            row = _require_row(session, calibration_id, lock=True)
+            row = _require_row(session, calibration_id, self._owner, lock=True)
             if row.state != "running":
                 return False
             if ending.camera is not None:
-                row.camera_revision = store_calibrated(session, row.camera, ending.camera).revision
+                row.camera_revision = store_calibrated(session, row.owner, row.camera, ending.camera).revision
             row.state, row.result, row.problem = ending.state, ending.result, ending.problem
             row.images = row.images if ending.images is None else ending.images
             row.progress = 1.0 if ending.state == "succeeded" else row.progress
@@ -270,10 +294,12 @@ class Calibrations:
             return True
 
 
-def _require_row(session: Session, calibration_id: str, *, lock: bool = False) -> CalibrationRow:
+def _require_row(session: Session, calibration_id: str, owner: str | None, *, lock: bool = False) -> CalibrationRow:
+    """The row, where it is the owner's, or anybody's for no owner."""
     row = None
     if re.fullmatch(ID_PATTERN, calibration_id):
         query = select(CalibrationRow).where(col(CalibrationRow.id) == calibration_id)
+        query = query if owner is None else query.where(col(CalibrationRow.owner) == owner)
         row = session.exec(query.with_for_update() if lock else query).first()
     if row is None:
         raise NotFound("There is no such calibration: GET /calibrations lists them.")

@@ -16,7 +16,9 @@ from sqlmodel import Session, col, select
 
 from service.errors import BadRequest, Conflict, NotFound, PreconditionFailed
 from service.optics.camera import Camera, Intrinsics, Lens
+from service.principal import LOCAL
 from service.storage.engine import reading, writing
+from service.storage.idempotency import Once, note, outcome_of
 from service.storage.tables import CameraRevisionRow, CameraRow
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
@@ -61,31 +63,27 @@ class CameraRecord:
 
 
 class Cameras:
-    """The cameras of one database; safe to share between threads."""
+    """An owner's cameras in one database; safe to share between threads. Another owner's are as if not there."""
 
-    def __init__(self, engine: Engine) -> None:
+    def __init__(self, engine: Engine, owner: str = LOCAL) -> None:
         self._engine = engine
+        self._owner = owner
 
-    def add(self, draft: CameraDraft) -> CameraRecord:
-        """Store a new camera. Raises ``Conflict`` where the name is taken."""
-        now = datetime.now(UTC)
+    def add(self, draft: CameraDraft, once: Once | None = None) -> CameraRecord:
+        """Store a new camera; with ``once``, the one that the same request stored before.
+
+        Raises ``Conflict`` where the name is taken, ``KeyReused`` where ``once`` came with another request.
+        """
         try:
-            with writing(self._engine) as session:
-                row = _find_row(session, draft.name, lock=True)
-                if row is not None and row.deleted_at is None:
-                    raise _taken(draft.name)
-                row = row or CameraRow(name=draft.name, revision=0, created_at=now, updated_at=now)
-                row.created_at = now
-                row.deleted_at = None
-                return _write_revision(session, row, draft, now)
-        except IntegrityError as exc:
-            # another process was faster between the look and the insert
-            raise _taken(draft.name) from exc
+            return self._add(draft, once)
+        except IntegrityError:
+            # another process was faster between the look and the insert: now there is something to be seen
+            return self._add(draft, once)
 
     def get(self, name: str) -> CameraRecord:
         """The camera at its current revision. Raises ``NotFound``."""
         with reading(self._engine) as session:
-            return _to_record(*_current(session, name))
+            return _to_record(*_current(session, self._owner, name))
 
     def page(self, limit: int, after: str | None = None) -> tuple[list[CameraRecord], bool]:
         """Up to ``limit`` cameras by name, from the one behind ``after``; and whether there are more."""
@@ -94,6 +92,7 @@ class Cameras:
             .join(CameraRevisionRow, col(CameraRevisionRow.camera_id) == col(CameraRow.id))
             .where(
                 col(CameraRevisionRow.revision) == col(CameraRow.revision),
+                col(CameraRow.owner) == self._owner,
                 col(CameraRow.deleted_at).is_(None),
             )
             .order_by(col(CameraRow.name))
@@ -111,7 +110,7 @@ class Cameras:
         Raises ``NotFound``, and ``PreconditionFailed`` where its revision is none of those ``expected``.
         """
         with writing(self._engine) as session:
-            row = _require_row(session, draft.name, expected)
+            row = _require_row(session, self._owner, draft.name, expected)
             return _write_revision(session, row, draft, datetime.now(UTC))
 
     def store_calibrated(self, name: str, camera: Camera) -> CameraRecord:
@@ -119,28 +118,44 @@ class Cameras:
         if not re.fullmatch(NAME_PATTERN, name):
             raise BadRequest(f"'{name[:80]}' is no name for a camera: letters, digits, '.', '_' and '-', 64 at most.")
         with writing(self._engine) as session:
-            return store_calibrated(session, name, camera)
+            return store_calibrated(session, self._owner, name, camera)
 
     def delete(self, name: str, expected: Sequence[int] | None = None) -> None:
         """Free the name; the revisions stay. Raises as ``replace`` does."""
         with writing(self._engine) as session:
-            row = _require_row(session, name, expected)
+            row = _require_row(session, self._owner, name, expected)
             row.deleted_at = datetime.now(UTC)
             session.add(row)
 
+    def _add(self, draft: CameraDraft, once: Once | None) -> CameraRecord:
+        now = datetime.now(UTC)
+        with writing(self._engine) as session:
+            stored = outcome_of(session, self._owner, once) if once else None
+            if stored is not None:
+                return _as_added(session, self._owner, draft.name, int(stored))
+            row = _find_row(session, self._owner, draft.name, lock=True)
+            if row is not None and row.deleted_at is None:
+                raise _taken(draft.name)
+            row = row or CameraRow(owner=self._owner, name=draft.name, revision=0, created_at=now, updated_at=now)
+            row.created_at, row.deleted_at = now, None
+            record = _write_revision(session, row, draft, now)
+            if once:
+                note(session, self._owner, once, str(record.revision))
+            return record
 
-def store_calibrated(session: Session, name: str, camera: Camera) -> CameraRecord:
+
+def store_calibrated(session: Session, owner: str, name: str, camera: Camera) -> CameraRecord:
     """Make the camera, or give it a new revision, with constants from a calibration; the description stays.
 
     For a caller's own transaction: an ``IntegrityError`` means that another process just made the name.
     """
     now = datetime.now(UTC)
-    row = _find_row(session, name, lock=True)
+    row = _find_row(session, owner, name, lock=True)
     if row is None or row.deleted_at is not None:
-        row = row or CameraRow(name=name, revision=0, created_at=now, updated_at=now)
+        row = row or CameraRow(owner=owner, name=name, revision=0, created_at=now, updated_at=now)
         row.created_at, row.deleted_at, description = now, None, None
     else:
-        description = _current(session, name)[1].description
+        description = _current(session, owner, name)[1].description
     return _write_revision(session, row, CameraDraft(name, camera, "calibration", description=description), now)
 
 
@@ -148,11 +163,11 @@ def _taken(name: str) -> Conflict:
     return Conflict(f"A camera '{name}' exists already: replace it with PUT /cameras/{name}.")
 
 
-def _find_row(session: Session, name: str, *, lock: bool = False) -> CameraRow | None:
+def _find_row(session: Session, owner: str, name: str, *, lock: bool = False) -> CameraRow | None:
     # what is no name is in no table, and PostgreSQL refuses some of it (a NUL) outright
     if not re.fullmatch(NAME_PATTERN, name):
         return None
-    query = select(CameraRow).where(col(CameraRow.name) == name)
+    query = select(CameraRow).where(col(CameraRow.owner) == owner, col(CameraRow.name) == name)
     return session.exec(query.with_for_update() if lock else query).first()
 
 
@@ -162,20 +177,33 @@ def _live(row: CameraRow | None, name: str) -> CameraRow:
     return row
 
 
-def _require_row(session: Session, name: str, expected: Sequence[int] | None) -> CameraRow:
+def _require_row(session: Session, owner: str, name: str, expected: Sequence[int] | None) -> CameraRow:
     """The row, locked until the end of the transaction, at one of the expected revisions."""
-    row = _live(_find_row(session, name, lock=True), name)
+    row = _live(_find_row(session, owner, name, lock=True), name)
     if expected is not None and row.revision not in expected:
         raise PreconditionFailed(f"Camera '{name}' is at revision {row.revision}: read it again, then repeat.")
     return row
 
 
-def _current(session: Session, name: str) -> tuple[CameraRow, CameraRevisionRow]:
-    row = _live(_find_row(session, name), name)
+def _current(session: Session, owner: str, name: str) -> tuple[CameraRow, CameraRevisionRow]:
+    row = _live(_find_row(session, owner, name), name)
+    return row, _revision(session, row, row.revision)
+
+
+def _revision(session: Session, row: CameraRow, number: int) -> CameraRevisionRow:
     query = select(CameraRevisionRow).where(
-        col(CameraRevisionRow.camera_id) == row.id, col(CameraRevisionRow.revision) == row.revision
+        col(CameraRevisionRow.camera_id) == row.id, col(CameraRevisionRow.revision) == number
     )
-    return row, session.exec(query).one()
+    return session.exec(query).one()
+
+
+def _as_added(session: Session, owner: str, name: str, number: int) -> CameraRecord:
+    """A camera as it was when it was added, whatever became of it since."""
+    row = _find_row(session, owner, name)
+    if row is None:
+        raise RuntimeError("a camera that was added has no row")
+    revision = _revision(session, row, number)
+    return CameraRecord(_to_record(row, revision).draft, number, revision.created_at, revision.created_at)
 
 
 def _write_revision(session: Session, row: CameraRow, draft: CameraDraft, now: datetime) -> CameraRecord:

@@ -34,12 +34,13 @@ class UtcDateTime(TypeDecorator[datetime]):
 
 
 class CameraRow(SQLModel, table=True):
-    """A name and the revision it stands for now; a deleted name keeps its row, and its count of revisions."""
+    """An owner's name and the revision it stands for now; a deleted one keeps its row, and its count of revisions."""
 
     __tablename__ = "cameras"
-    __table_args__ = (UniqueConstraint("name"),)
+    __table_args__ = (UniqueConstraint("owner", "name"),)
 
     id: int | None = Field(default=None, primary_key=True)
+    owner: str = Field(max_length=64)
     name: str = Field(max_length=64)
     revision: int
     created_at: datetime = Field(sa_type=UtcDateTime)
@@ -85,6 +86,7 @@ class CalibrationRow(SQLModel, table=True):
     # the order they came in; clients know the id alone
     number: int | None = Field(default=None, primary_key=True)
     id: str = Field(max_length=32)
+    owner: str = Field(max_length=64)
     spool: str = Field(max_length=32)
     camera: str = Field(max_length=64)
     state: str = Field(max_length=16, index=True)
@@ -99,3 +101,31 @@ class CalibrationRow(SQLModel, table=True):
     pictures: list[dict[str, str]] = Field(sa_column=Column(JSON, nullable=False))
     images: JsonValue = Field(sa_column=Column(JSON, nullable=False))
     result: JsonValue = Field(default=None, sa_column=Column(JSON(none_as_null=True), nullable=True))
+
+
+class ApiKeyRow(SQLModel, table=True):
+    """An API key: its public half, a hash of its secret half, and what it may do; kept when it is revoked."""
+
+    __tablename__ = "api_keys"
+
+    id: str = Field(primary_key=True, max_length=16)
+    digest: str = Field(max_length=64)
+    name: str = Field(max_length=64)
+    owner: str = Field(max_length=64)
+    scopes: list[str] = Field(sa_column=Column(JSON, nullable=False))
+    created_at: datetime = Field(sa_type=UtcDateTime)
+    expires_at: datetime | None = Field(default=None, sa_type=UtcDateTime)
+    last_used_at: datetime | None = Field(default=None, sa_type=UtcDateTime)
+    revoked_at: datetime | None = Field(default=None, sa_type=UtcDateTime)
+
+
+class IdempotencyRow(SQLModel, table=True):
+    """What an owner's Idempotency-Key was used for: a hash of the request, and what came of it."""
+
+    __tablename__ = "idempotency_keys"
+
+    owner: str = Field(primary_key=True, max_length=64)
+    key: str = Field(primary_key=True, max_length=255)
+    fingerprint: str = Field(max_length=64)
+    outcome: str = Field(max_length=80)
+    created_at: datetime = Field(sa_type=UtcDateTime, index=True)

@@ -1,0 +1,94 @@
+"""Who may do what: API keys in front of every request but those for health, their scopes, and a quota for each.
+
+A scope is asked for by path, before a route or a body is looked at; a path that is not named here takes any key.
+"""
+
+import math
+import time
+
+from fastapi.concurrency import run_in_threadpool
+from limits import RateLimitItemPerMinute
+from limits.storage import MemoryStorage
+from limits.strategies import MovingWindowRateLimiter
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from service.errors import Forbidden, QuotaExceeded, Unauthorized
+from service.principal import ANYBODY, Principal
+from service.principal import Scope as KeyScope
+from service.storage.keys import ApiKey, Keys
+
+PUBLIC = "/health"
+READING = frozenset({"GET", "HEAD", "OPTIONS"})
+# below each path: the scope to read, and the scope to do anything else; the longest path that fits counts
+SCOPES_BY_PATH: dict[str, tuple[KeyScope | None, KeyScope | None]] = {
+    "/depth": ("depth", "depth"),
+    "/cameras": ("cameras:read", "cameras:write"),
+    "/calibrate": ("calibrate", "calibrate"),
+    "/calibrate/target.svg": (None, None),
+    "/calibrate/target.pdf": (None, None),
+    "/calibrations": ("calibrate", "calibrate"),
+    "/metrics": ("admin", "admin"),
+}
+
+
+class Authenticate:
+    """Puts a ``Principal`` into the request's state: the key's owner, or ``ANYBODY`` where no key is asked for.
+
+    Raises ``Unauthorized``, ``Forbidden`` and ``QuotaExceeded``.
+    """
+
+    def __init__(self, app: ASGIApp, *, is_on: bool, requests_per_minute: int) -> None:
+        self._app = app
+        self._is_on = is_on
+        self._quota = RateLimitItemPerMinute(requests_per_minute) if requests_per_minute else None
+        self._limiter = MovingWindowRateLimiter(MemoryStorage())
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "http":
+            state = scope.setdefault("state", {})
+            state["principal"] = await self._principal(scope) if self._is_on else ANYBODY
+        await self._app(scope, receive, send)
+
+    async def _principal(self, scope: Scope) -> Principal:
+        if is_public(scope["path"]):
+            return ANYBODY
+        keys: Keys = scope["app"].state.keys
+        scheme, _, text = Headers(scope=scope).get("authorization", "").partition(" ")
+        if scheme.lower() != "bearer":
+            raise Unauthorized("Send an API key: Authorization: Bearer camind_...")
+        key = await run_in_threadpool(keys.find, text.strip())
+        if key is None:
+            raise Unauthorized("This API key is unknown, revoked or expired.")
+        self._count(key)
+        needed = needed_scope(scope["method"], scope["path"])
+        if needed is not None and needed not in key.scopes:
+            raise Forbidden(f"This API key lacks the scope {needed}.", scope=needed)
+        return Principal(key.owner, key.scopes, key.id)
+
+    def _count(self, key: ApiKey) -> None:
+        if self._quota is None or self._limiter.hit(self._quota, key.id):
+            return
+        wait_s = self._limiter.get_window_stats(self._quota, key.id).reset_time - time.time()
+        raise QuotaExceeded(
+            f"This API key has had its {self._quota.amount} requests of this minute.",
+            retry_after_s=max(1, math.ceil(wait_s)),
+        )
+
+
+def is_public(path: str) -> bool:
+    """Whether the path answers without a key."""
+    return _is_below(path, PUBLIC)
+
+
+def needed_scope(method: str, path: str) -> KeyScope | None:
+    """The scope a key must have for this; None where any key will do."""
+    fitting = [prefix for prefix in SCOPES_BY_PATH if _is_below(path, prefix)]
+    if not fitting:
+        return None
+    to_read, to_change = SCOPES_BY_PATH[max(fitting, key=len)]
+    return to_read if method in READING else to_change
+
+
+def _is_below(path: str, prefix: str) -> bool:
+    return path == prefix or path.startswith(f"{prefix}/")

@@ -1,0 +1,23 @@
+"""Whom a request is for, and what it may do."""
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+Scope = Literal["depth", "cameras:read", "cameras:write", "calibrate", "admin"]
+SCOPES: tuple[Scope, ...] = get_args(Scope)
+EVERYDAY = SCOPES[:-1]
+
+# the owner of what is made without API keys
+LOCAL = "local"
+
+
+@dataclass(frozen=True, slots=True)
+class Principal:
+    """The owner of what a request makes and sees, what it may do, and the key it came with, if any."""
+
+    owner: str
+    scopes: frozenset[Scope]
+    key_id: str | None = None
+
+
+ANYBODY = Principal(LOCAL, frozenset(SCOPES))

@@ -1,0 +1,299 @@
+"""API keys: nobody gets in without one, nobody sees another's things, and nobody but its user has a key's secret."""
+
+import json
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi import FastAPI
+from httpx2 import Response
+from sqlalchemy import Connection, Engine, event
+from starlette.testclient import TestClient
+
+from model_export.served import serving
+from service.access import needed_scope
+from service.app import create_app
+from service.config import Settings
+from service.errors import BadRequest, NotFound
+from service.principal import SCOPES, Scope
+from service.storage.keys import Keys
+from tests.fake_calibration import SETTINGS, FakeCalibration
+from tests.inference.photographs import corners, png
+from tests.test_cli import camind
+
+PROBLEM = "application/problem+json"
+NOWHERE = "/no-such-thing"
+OPEN = {"/health/live", "/health/ready"}
+Part = tuple[str, tuple[str | None, bytes | str, str]]
+CAMERA = {"name": "bench", "image_width_px": 4, "image_height_px": 3, "focus_distance_m": 1.0, "k_cam_px": 2.0}
+
+
+@pytest.fixture
+def settings(settings: Settings) -> Settings:
+    return settings.model_copy(update={"api_keys": "on", "key_requests_per_minute": 200})
+
+
+@pytest.fixture
+def app(settings: Settings) -> FastAPI:
+    return create_app(settings, FakeCalibration())
+
+
+@pytest.fixture
+def keys(client: TestClient, app: FastAPI) -> Keys:
+    assert client.get("/health/live").status_code == 200
+    found: Keys = app.state.keys
+    return found
+
+
+def bearer(keys: Keys, owner: str, *scopes: Scope, **more: Any) -> dict[str, str]:
+    return {"Authorization": f"Bearer {keys.create(owner, owner, scopes or SCOPES, **more)[1]}"}
+
+
+def refused(answer: Response, status: int, kind: str) -> None:
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == PROBLEM
+    assert answer.json()["type"] == f"urn:camind:problem:{kind}"
+    assert answer.headers["x-request-id"]
+
+
+def operations(app: FastAPI) -> Iterator[tuple[str, str, list[str]]]:
+    """Every method, path and the scopes its description asks for."""
+    for path, item in app.openapi()["paths"].items():
+        for method, operation in item.items():
+            scopes = operation["security"][0]["apiKey"] if "security" in operation else []
+            yield method.upper(), path, scopes
+
+
+def test_every_path_but_health_asks_for_a_key(app: FastAPI, client: TestClient) -> None:
+    asked = {(method, path.format(name="x", id="0" * 32)) for method, path, _ in operations(app)}
+    for method, path in sorted(asked | {("GET", "/"), ("GET", "/docs"), ("GET", "/openapi.json"), ("GET", NOWHERE)}):
+        answer = client.request(method, path)
+        if path in OPEN:
+            assert answer.status_code == 200
+            continue
+        refused(answer, 401, "unauthorized")
+        assert answer.headers["www-authenticate"] == "Bearer"
+
+
+@pytest.mark.parametrize("words", ["", "Bearer", "Bearer x", "Basic eDp5", "Bearer camind_0123456789ab_" + "x" * 43])
+def test_what_is_no_key_lets_nobody_in(client: TestClient, words: str) -> None:
+    refused(client.get("/cameras", headers={"Authorization": words}), 401, "unauthorized")
+
+
+def test_a_key_opens_what_its_scope_names_and_nothing_else(app: FastAPI, client: TestClient, keys: Keys) -> None:
+    for method, path, scopes in operations(app):
+        if path in OPEN:
+            continue
+        url = path.format(name="x", id="0" * 32)
+        others = [scope for scope in SCOPES if scope not in scopes]
+        answer = client.request(method, url, headers=bearer(keys, "lab", *others))
+        if not scopes:
+            assert answer.status_code not in (401, 403), (method, path)
+            continue
+        refused(answer, 403, "forbidden")
+        assert scopes[0] in answer.headers["www-authenticate"]
+        with_it = client.request(method, url, headers=bearer(keys, "lab", *[s for s in SCOPES if s in scopes]))
+        assert with_it.status_code not in (401, 403), (method, path)
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "scope"),
+    [
+        ("POST", "/depth", "depth"),
+        ("GET", "/cameras", "cameras:read"),
+        ("HEAD", "/cameras/a/curve", "cameras:read"),
+        ("POST", "/cameras", "cameras:write"),
+        ("PUT", "/cameras/a", "cameras:write"),
+        ("DELETE", "/cameras/a", "cameras:write"),
+        ("POST", "/calibrate", "calibrate"),
+        ("GET", "/calibrations/a/events", "calibrate"),
+        ("DELETE", "/calibrations/a", "calibrate"),
+        ("GET", "/metrics", "admin"),
+        ("GET", "/calibrate/target.pdf", None),
+        ("GET", "/model", None),
+        ("GET", "/camerasx", None),
+    ],
+)
+def test_the_scope_of_a_path(method: str, path: str, scope: str | None) -> None:
+    assert needed_scope(method, path) == scope
+
+
+def test_cameras_belong_to_an_owner(client: TestClient, keys: Keys) -> None:
+    mine, theirs = bearer(keys, "lab"), bearer(keys, "shop")
+    assert client.post("/cameras", json=CAMERA, headers=mine).status_code == 201
+    for method, path in (("GET", ""), ("GET", "/curve"), ("DELETE", "")):
+        refused(client.request(method, f"/cameras/bench{path}", headers=theirs), 404, "not-found")
+    body = {field: value for field, value in CAMERA.items() if field != "name"}
+    refused(client.put("/cameras/bench", json=body, headers=theirs), 404, "not-found")
+    photograph = client.post(
+        "/depth?camera=bench", content=png(corners(4, 3)), headers=theirs | {"Content-Type": "image/png"}
+    )
+    refused(photograph, 404, "not-found")
+    assert client.get("/cameras", headers=theirs).json()["items"] == []
+    # the name is free for others, and what they do with it changes nothing here
+    assert client.post("/cameras", json=CAMERA | {"k_cam_px": 3.0}, headers=theirs).status_code == 201
+    assert client.delete("/cameras/bench", headers=theirs).status_code == 204
+    assert client.get("/cameras/bench", headers=mine).json()["k_cam_px"] == 2.0
+
+
+def test_calibrations_belong_to_an_owner_with_the_camera_they_make(client: TestClient, keys: Keys) -> None:
+    mine, theirs = bearer(keys, "lab"), bearer(keys, "shop")
+    files: list[Part] = [
+        ("settings", (None, json.dumps({**SETTINGS, "register": True}), "application/json")),
+        ("defocused", ("near.png", png(corners()), "image/png")),
+    ]
+    answer = client.post("/calibrate?camera=bench", files=files, headers=mine | {"Prefer": "wait=20"})
+    assert (answer.status_code, answer.json()["state"]) == (200, "succeeded")
+    path = answer.headers["location"]
+    for method, end in (("GET", ""), ("GET", "/events"), ("GET", "/plot.svg"), ("DELETE", "")):
+        refused(client.request(method, path + end, headers=theirs), 404, "not-found")
+    assert client.get("/calibrations", headers=theirs).json()["items"] == []
+    assert len(client.get("/calibrations", headers=mine).json()["items"]) == 1
+    assert client.get("/cameras/bench", headers=mine).json()["source"] == "calibration"
+    refused(client.get("/cameras/bench", headers=theirs), 404, "not-found")
+
+
+def test_a_new_key_takes_the_place_of_a_revoked_one(client: TestClient, keys: Keys) -> None:
+    key, text = keys.create("first", "lab")
+    old = {"Authorization": f"Bearer {text}"}
+    assert client.post("/cameras", json=CAMERA, headers=old).status_code == 201
+    keys.revoke(key.id)
+    refused(client.get("/cameras/bench", headers=old), 401, "unauthorized")
+    assert client.get("/cameras/bench", headers=bearer(keys, "lab")).status_code == 200
+
+
+def test_a_key_for_local_opens_what_was_made_without_keys(settings: Settings) -> None:
+    with TestClient(create_app(settings.model_copy(update={"api_keys": "off"}))) as before:
+        assert before.post("/cameras", json=CAMERA).status_code == 201
+    app = create_app(settings)
+    with TestClient(app) as after:
+        assert after.get("/cameras/bench", headers=bearer(app.state.keys, "local")).status_code == 200
+        refused(after.get("/cameras/bench", headers=bearer(app.state.keys, "lab")), 404, "not-found")
+
+
+def test_a_key_expires(client: TestClient, keys: Keys) -> None:
+    soon = bearer(keys, "lab", expires_at=datetime.now(UTC) + timedelta(seconds=0.5))
+    assert client.get("/cameras", headers=soon).status_code == 200
+    time.sleep(0.6)
+    refused(client.get("/cameras", headers=soon), 401, "unauthorized")
+
+
+def test_a_key_has_its_own_quota(settings: Settings) -> None:
+    app = create_app(settings.model_copy(update={"key_requests_per_minute": 3}))
+    with TestClient(app) as client:
+        busy, other = bearer(app.state.keys, "lab"), bearer(app.state.keys, "lab")
+        assert [client.get("/cameras", headers=busy).status_code for _ in range(3)] == [200] * 3
+        answer = client.get("/cameras", headers=busy)
+        refused(answer, 429, "quota-exceeded")
+        assert 1 <= int(answer.headers["retry-after"]) <= 60
+        assert client.get("/cameras", headers=other).status_code == 200
+        assert client.get("/health/ready").status_code == 200
+
+
+def test_a_body_is_not_received_for_nobody(client: TestClient) -> None:
+    endless = (b"x" * 65536 for _ in range(1000))
+    refused(client.post("/depth?camera=x", content=endless, headers={"Content-Type": "image/png"}), 401, "unauthorized")
+
+
+def test_without_keys_a_key_is_no_matter(settings: Settings) -> None:
+    with TestClient(create_app(settings.model_copy(update={"api_keys": "off"}))) as client:
+        assert client.get("/cameras", headers={"Authorization": "Bearer x"}).status_code == 200
+
+
+def test_the_secret_is_with_its_user_alone(engine: Engine) -> None:
+    key, text = Keys(engine).create("robot", "lab")
+    secret = text.rpartition(key.id + "_")[2]
+    assert len(secret) == 43
+    with engine.connect() as connection:
+        stored = connection.exec_driver_sql("SELECT * FROM api_keys").all()
+    assert key.id in str(stored)
+    assert secret not in str(stored)
+    assert secret not in repr(key)
+
+
+def test_use_is_noted_once_a_minute(engine: Engine) -> None:
+    keys = Keys(engine)
+    _, text = keys.create("robot", "lab")
+    assert keys.every()[0].last_used_at is None
+    assert keys.find(text) is not None
+    first = keys.every()[0].last_used_at
+    assert first is not None
+    assert keys.find(text) is not None
+    assert keys.every()[0].last_used_at == first
+
+
+def test_a_wrong_key_costs_what_an_unknown_one_does(engine: Engine) -> None:
+    keys = Keys(engine)
+    key, text = keys.create("robot", "lab")
+    statements: list[str] = []
+
+    def note(_c: Connection, _k: object, statement: str, *_: object) -> None:
+        statements.append(statement)
+
+    event.listen(engine, "before_cursor_execute", note)
+    wrong = text[:-4] + ("AAAA" if not text.endswith("AAAA") else "BBBB")
+    costs = []
+    for attempt in (wrong, text.replace(key.id, "0" * 12), "nonsense"):
+        statements.clear()
+        assert keys.find(attempt) is None
+        costs.append(list(statements))
+    assert costs[0] == costs[1] == costs[2]
+    assert costs[0]
+
+
+def test_keys_are_found_named_and_revoked(engine: Engine) -> None:
+    keys = Keys(engine)
+    assert not keys.has_good()
+    key, text = keys.create("robot", "lab", ["calibrate", "depth"])
+    assert keys.has_good()
+    assert keys.find(text) is not None
+    assert keys.every()[0].scopes == {"depth", "calibrate"}
+    revoked = keys.revoke(key.id)
+    assert keys.revoke(key.id).revoked_at == revoked.revoked_at
+    assert keys.find(text) is None
+    assert not keys.has_good()
+    with pytest.raises(NotFound):
+        keys.revoke("0" * 12)
+    with pytest.raises(BadRequest):
+        keys.create("a b", "lab")
+
+
+def test_keys_from_the_command_line(tmp_path: Path) -> None:
+    made = camind(tmp_path, "keys", "create", "robot", "--scope", "depth", "--days", "2")
+    assert made.returncode == 0, made.stderr
+    text = made.stdout.strip()
+    listed = camind(tmp_path, "keys", "list").stdout
+    key_id, name, owner, scopes, state, *_ = listed.strip().split("\t")
+    assert (name, owner, scopes, state) == ("robot", "robot", "depth", "good")
+    assert text.startswith(f"camind_{key_id}_")
+    assert text.rpartition("_")[2] not in listed
+    assert camind(tmp_path, "keys", "revoke", key_id).returncode == 0
+    assert "\trevoked\t" in camind(tmp_path, "keys", "list").stdout
+    wrong = camind(tmp_path, "keys", "create", "robot", "--scope", "all")
+    assert (wrong.returncode, wrong.stdout) == (2, "")
+    assert camind(tmp_path, "keys", "revoke", "nobody").returncode == 1
+
+
+def test_the_log_names_the_key_but_not_its_secret(tmp_path: Path, tiny_model_dir: Path) -> None:
+    data_dir = tmp_path / "data"
+    text = camind(data_dir, "keys", "create", "robot").stdout.strip()
+    on = {"CAMIND_API_KEYS": "on", "CAMIND_LOG_LEVEL": "debug"}
+    with serving(data_dir, "--model", tiny_model_dir, settings=on) as server:
+        assert server.ask("GET", "/cameras", headers={"Authorization": f"Bearer {text}"}).status == 200
+        assert server.ask("GET", "/cameras", headers={"Authorization": f"Bearer {text}x"}).status == 401
+        seen = [json.loads(line) for line in server.log.splitlines() if line.startswith("{")]
+        asked = [line for line in seen if line.get("path") == "/cameras" or line.get("status") == 401]
+        assert [(line["status"], line.get("key")) for line in asked] == [(200, text.split("_")[1]), (401, None)]
+        assert text.rpartition("_")[2] not in server.log
+
+
+def test_nobody_serves_others_without_keys_by_mistake(tmp_path: Path, tiny_model_dir: Path) -> None:
+    serve = ("serve", "--host", "0.0.0.0", "--port", "0", "--model", str(tiny_model_dir))  # noqa: S104
+    done = camind(tmp_path, *serve)
+    assert done.returncode == 2
+    assert "camind keys create" in done.stderr
+    assert "CAMIND_API_KEYS=off" in done.stderr
+    assert "Traceback" not in done.stderr
