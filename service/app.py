@@ -25,6 +25,7 @@ from service.storage.keys import Keys
 from service.storage.spool import Spool
 
 DEPTH_PATH = "/depth"
+FROM_PHOTO_PATH = "/cameras/from-photo"
 CALIBRATE_PATH = "/calibrate"
 DESCRIPTION = """\
 How far away is each pixel of this single photograph, in metres, given the camera that took it?
@@ -66,11 +67,13 @@ def create_app(settings: Settings, calibrate: Calibrate = calibrate) -> FastAPI:
 
 def _add_middleware(app: FastAPI, settings: Settings) -> None:
     # the last one added is the outermost
+    photograph = BodyLimits(settings.max_image_bytes, settings.receive_deadline_s)
     app.add_middleware(
         LimitRequests,
         limits=BodyLimits(settings.max_json_bytes, settings.receive_deadline_s),
         limits_by_path={
-            DEPTH_PATH: BodyLimits(settings.max_image_bytes, settings.receive_deadline_s),
+            DEPTH_PATH: photograph,
+            FROM_PHOTO_PATH: photograph,
             CALIBRATE_PATH: BodyLimits(settings.max_calibration_bytes, settings.calibration_receive_deadline_s),
         },
     )

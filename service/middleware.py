@@ -190,8 +190,8 @@ def _request_id(scope: Scope) -> str:
 
 def _camera(scope: Scope, path: str | None) -> dict[str, str]:
     """The camera a request is about, for the log."""
-    if path and path.startswith("/cameras/"):
-        return {"camera": str(scope["path_params"].get("name", ""))[:64]}
+    if path and path.startswith("/cameras/{name}"):
+        return {"camera": str(scope["path_params"]["name"])[:64]}
     names = parse_qs(scope["query_string"].decode("ascii", "replace")).get("camera", [])
     return {"camera": names[0][:64]} if names else {}
 

@@ -3,30 +3,38 @@
 import re
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Header, Query, Response
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
 
 from service.api.cursors import cursor_after, name_of
-from service.api.dependencies import CamerasDep, IdempotencyKey, require_json
+from service.api.dependencies import CamerasDep, IdempotencyKey, SettingsDep, require_json
 from service.api.problems import responses
 from service.api.schemas import (
     CameraCreate,
+    CameraDraftRead,
     CameraPage,
     CameraRead,
     CameraReplace,
     CurvePoint,
     CurveRead,
 )
+from service.api.uploads import REQUEST_BODY, receive_photograph
 from service.errors import (
     BadRequest,
     Busy,
     Conflict,
     FieldProblem,
+    InvalidImage,
     KeyReused,
     NotFound,
     NotReady,
     PreconditionFailed,
+    TooLarge,
     UnsupportedKind,
 )
+from service.inference.drafting import Draft, draft_camera
+from service.inference.exif import read_exif
+from service.inference.headers import read_header
 from service.optics import thin_lens
 from service.optics.camera import RANGE_BLUR_ERROR_PX, Camera
 from service.storage.cameras import CameraRecord
@@ -84,6 +92,19 @@ def list_cameras(
         items=[CameraRead.from_record(record) for record in records],
         next_cursor=cursor_after(records[-1].name) if has_more else None,
     )
+
+
+@router.post(
+    "/from-photo",
+    operation_id="draftCamera",
+    summary="Draft a camera from a photograph",
+    responses=responses(BadRequest, InvalidImage, TooLarge, UnsupportedKind),
+    openapi_extra={"requestBody": REQUEST_BODY},
+)
+async def draft_camera_from_photo(request: Request, settings: SettingsDep) -> CameraDraftRead:
+    """What the photograph's EXIF tells of the camera that took it; nothing is stored, of either."""
+    upload = await receive_photograph(request, settings.max_image_bytes)
+    return CameraDraftRead.from_draft(await run_in_threadpool(_drafted, upload.data))
 
 
 @router.get(
@@ -155,6 +176,11 @@ def read_curve(
         focus_distance_m=focus_m,
         points=[_curve_point(record.camera, depth_m) for depth_m in depths],
     )
+
+
+def _drafted(data: bytes) -> Draft:
+    header = read_header(data)
+    return draft_camera(read_exif(data), header.width_px, header.height_px)
 
 
 def _answer(record: CameraRecord, response: Response) -> CameraRead:

@@ -13,7 +13,7 @@ from service.api.dependencies import CamerasDep, EstimatorDep, SettingsDep, Work
 from service.api.depth_schemas import DepthQuery, DepthRead, PointRead, SpreadRead
 from service.api.negotiation import choose_format
 from service.api.problems import responses
-from service.api.uploads import FIELD, MULTIPART, Upload, receive_photograph
+from service.api.uploads import REQUEST_BODY, Upload, receive_photograph
 from service.errors import (
     BadRequest,
     Busy,
@@ -30,7 +30,6 @@ from service.inference.depth_map import DepthMap
 from service.inference.encode import ENCODERS, MEDIA_TYPES, Encoded, pixel_at, read_point, spread_of
 from service.inference.estimator import Estimator
 from service.inference.frame import camera_of
-from service.inference.images import MEDIA_TYPES as IMAGE_TYPES
 from service.inference.images import ImageLimits, read_photograph
 from service.inference.pair import Stopwatch
 from service.inference.part import Part
@@ -104,23 +103,7 @@ router = APIRouter(tags=["depth"])
             Busy,
         ),
     },
-    openapi_extra={
-        "requestBody": {
-            "required": True,
-            "description": f"The photograph itself, or a form with it in the field `{FIELD}`",
-            "content": {
-                **{name: {"schema": {"type": "string", "format": "binary"}} for name in IMAGE_TYPES},
-                MULTIPART: {
-                    "schema": {
-                        "type": "object",
-                        "required": [FIELD],
-                        "additionalProperties": False,
-                        "properties": {FIELD: {"type": "string", "format": "binary"}},
-                    }
-                },
-            },
-        }
-    },
+    openapi_extra={"requestBody": REQUEST_BODY},
 )
 async def estimate_depth(
     request: Request,

@@ -8,10 +8,27 @@ from starlette.datastructures import UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 
 from service.errors import BadRequest, FieldProblem, TooLarge
-from service.inference.images import declared_kind
+from service.inference.images import MEDIA_TYPES, declared_kind
 
 FIELD = "image"
 MULTIPART = "multipart/form-data"
+BINARY = {"type": "string", "format": "binary"}
+# what a route that takes a photograph says of its body
+REQUEST_BODY = {
+    "required": True,
+    "description": f"The photograph itself, or a form with it in the field `{FIELD}`",
+    "content": {
+        **{name: {"schema": BINARY} for name in MEDIA_TYPES},
+        MULTIPART: {
+            "schema": {
+                "type": "object",
+                "required": [FIELD],
+                "additionalProperties": False,
+                "properties": {FIELD: BINARY},
+            }
+        },
+    },
+}
 # boundaries and part headers around the picture
 MULTIPART_OVERHEAD_BYTES = 16_384
 

@@ -2,6 +2,7 @@
 
 import struct
 import zlib
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -11,6 +12,8 @@ from service.opencv import cv2
 
 Pixels = NDArray[Any]
 Order = Literal["<", ">"]
+ExifValue = int | str | tuple[int, int]
+ExifTags = Mapping[int, ExifValue]
 
 
 def corners(height: int = 48, width: int = 64) -> NDArray[np.uint8]:
@@ -39,13 +42,44 @@ def exif_block(orientation: int, order: Order = "<") -> bytes:
     return mark + struct.pack(order + "IH", 8, 1) + entry + struct.pack(order + "I", 0)
 
 
+def exif_of(main: ExifTags, shot: ExifTags, place: ExifTags | None = None) -> bytes:
+    """A TIFF structure with these tags in its main, EXIF and GPS directories: whole numbers, text and rationals."""
+    out = bytearray(b"II*\x00\x00\x00\x00\x00")
+    pointers: dict[int, ExifValue] = {0x8769: _add_directory(out, shot)}
+    if place:
+        pointers[0x8825] = _add_directory(out, place)
+    out[4:8] = struct.pack("<I", _add_directory(out, {**main, **pointers}))
+    return bytes(out)
+
+
+def _add_directory(out: bytearray, tags: ExifTags) -> int:
+    entries = b""
+    for tag, value in sorted(tags.items()):
+        if isinstance(value, int):
+            entries += struct.pack("<HHII", tag, 4, 1, value)
+            continue
+        stored = value.encode() + b"\x00" if isinstance(value, str) else struct.pack("<II", *value)
+        kind, count = (2, len(stored)) if isinstance(value, str) else (5, 1)
+        if len(stored) <= 4:
+            entries += struct.pack("<HHI", tag, kind, count) + stored.ljust(4, b"\x00")
+        else:
+            entries += struct.pack("<HHII", tag, kind, count, len(out))
+            out += stored
+    offset = len(out)
+    out += struct.pack("<H", len(tags)) + entries + struct.pack("<I", 0)
+    return offset
+
+
+def with_exif(data: bytes, exif: bytes) -> bytes:
+    """A JPEG with an EXIF block."""
+    payload = b"Exif\x00\x00" + exif
+    return data[:2] + b"\xff\xe1" + struct.pack(">H", len(payload) + 2) + payload + data[2:]
+
+
 def jpeg(rgb: Pixels, orientation: int | None = None, order: Order = "<", quality: int = 98) -> bytes:
     """A JPEG, with an EXIF orientation if one is given."""
     data = encoded(".jpg", rgb, cv2.IMWRITE_JPEG_QUALITY, quality)
-    if orientation is None:
-        return data
-    payload = b"Exif\x00\x00" + exif_block(orientation, order)
-    return data[:2] + b"\xff\xe1" + struct.pack(">H", len(payload) + 2) + payload + data[2:]
+    return data if orientation is None else with_exif(data, exif_block(orientation, order))
 
 
 def png_chunk(name: bytes, payload: bytes) -> bytes:

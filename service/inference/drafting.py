@@ -1,0 +1,128 @@
+"""A camera drafted from a photograph's EXIF: what is sure, what is a guess, and what is missing.
+
+The 35-mm-equivalent focal length never stands for the focal length. With the real one beside it, it tells how large
+the sensor is, as a last resort.
+"""
+
+import math
+import re
+from dataclasses import dataclass
+from functools import lru_cache
+
+import lensfunpy
+
+from service.inference.exif import Exif
+
+FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
+SENSOR_WIDTHS_MM = (1.0, 70.0)
+FOCUS_DISTANCES_M = (0.001, 100_000.0)
+MOST_ZOOM = 1.01
+# of the long side to the short one; others are cut out of one of these
+SENSOR_ASPECTS = (4 / 3, 3 / 2)
+ASPECT_TOLERANCE = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Draft:
+    """A camera to be; None for what the photograph does not tell. Lengths in the units of their names."""
+
+    name: str
+    description: str | None
+    image_width_px: int
+    image_height_px: int
+    focus_distance_m: float | None
+    focal_length_mm: float | None
+    f_number: float | None
+    pixel_pitch_um: float | None
+    sensor_width_px: int | None
+    warnings: tuple[str, ...]
+
+
+def draft_camera(exif: Exif, width_px: int, height_px: int) -> Draft:
+    """The camera of a photograph of this stored size, from its EXIF."""
+    warnings: list[str] = []
+    sensor_width_px = max(exif.width_px or width_px, width_px)
+    if sensor_width_px != width_px:
+        warnings.append(
+            f"EXIF says {sensor_width_px} pixels wide and the file has {width_px}: taken as resized; a crop would "
+            "make k_cam wrong"
+        )
+    width_mm = _sensor_width_mm(exif, sensor_width_px, width_px / height_px, warnings)
+    for value, words in (
+        (exif.focal_length_mm, "the focal length is not in its EXIF: lens.focal_length_mm is needed"),
+        (exif.f_number, "the aperture is not in its EXIF: lens.f_number is needed"),
+        (width_mm, "nothing tells the size of the sensor: lens.pixel_pitch_um is needed"),
+    ):
+        if value is None:
+            warnings.append(words)
+    if (exif.digital_zoom or 1) > MOST_ZOOM:
+        warnings.append(f"taken with a digital zoom of {exif.digital_zoom:g}: the frame is a part of the sensor's")
+    return Draft(
+        name=_name(exif),
+        description=", ".join(filter(None, (_body(exif), exif.lens))) or None,
+        image_width_px=width_px,
+        image_height_px=height_px,
+        focus_distance_m=_focus_m(exif, warnings),
+        focal_length_mm=exif.focal_length_mm,
+        f_number=exif.f_number,
+        pixel_pitch_um=width_mm and round(1e3 * width_mm / sensor_width_px, 4),
+        sensor_width_px=sensor_width_px,
+        warnings=tuple(warnings),
+    )
+
+
+def _focus_m(exif: Exif, warnings: list[str]) -> float | None:
+    distance_m = exif.subject_distance_m
+    if distance_m is None or not FOCUS_DISTANCES_M[0] <= distance_m <= FOCUS_DISTANCES_M[1]:
+        warnings.append("its EXIF does not say where the lens was focused: focus_distance_m is needed")
+        return None
+    warnings.append(f"focused at {distance_m:g} m as the camera reports it, which is often coarse: measure if you can")
+    return distance_m
+
+
+def _sensor_width_mm(exif: Exif, sensor_width_px: int, aspect: float, warnings: list[str]) -> float | None:
+    """From the pixel pitch, else the camera's known crop factor, else the two focal lengths; the surest first."""
+    if exif.focal_plane_pitch_um:
+        width_mm = exif.focal_plane_pitch_um * sensor_width_px / 1e3
+        if SENSOR_WIDTHS_MM[0] <= width_mm <= SENSOR_WIDTHS_MM[1]:
+            return width_mm
+        warnings.append(f"its EXIF makes the sensor {width_mm:.3g} mm wide, which cannot be, and was not believed")
+    crop = _known_crop(exif.make or "", exif.model or "")
+    if crop is not None:
+        warnings.append(f"the sensor's size is that of a crop factor of {crop:.4g}, from a list of cameras")
+    elif exif.focal_length_35mm and exif.focal_length_mm:
+        crop = exif.focal_length_35mm / exif.focal_length_mm / (exif.digital_zoom or 1)
+        warnings.append(
+            f"the sensor's size follows from the 35-mm equivalent, {exif.focal_length_35mm:g} mm for "
+            f"{exif.focal_length_mm:g}, which is rounded: k_cam may be off by some percent"
+        )
+    else:
+        return None
+    if not any(math.isclose(max(aspect, 1 / aspect), known, rel_tol=ASPECT_TOLERANCE) for known in SENSOR_ASPECTS):
+        warnings.append("the picture is neither 4:3 nor 3:2: the sensor may be larger than the frame it took")
+    width_mm = FULL_FRAME_DIAGONAL_MM / crop * aspect / math.hypot(aspect, 1)
+    return width_mm if SENSOR_WIDTHS_MM[0] <= width_mm <= SENSOR_WIDTHS_MM[1] else None
+
+
+@lru_cache(maxsize=256)
+def _known_crop(make: str, model: str) -> float | None:
+    """The crop factor of a camera in lensfun's list, by its exact names."""
+    found = _lensfun().find_cameras(make, model) if make and model else []
+    return float(found[0].crop_factor) if found else None
+
+
+@lru_cache(maxsize=1)
+def _lensfun() -> lensfunpy.Database:
+    return lensfunpy.Database()
+
+
+def _body(exif: Exif) -> str:
+    """Make and model, the make once: Nikon writes it into both."""
+    make, model = exif.make or "", exif.model or ""
+    return model if model.lower().startswith(make.lower().partition(" ")[0]) else f"{make} {model}".strip()
+
+
+def _name(exif: Exif) -> str:
+    numbers = ((exif.focal_length_mm, "{:g}mm"), (exif.f_number, "f{:g}"))
+    words = [_body(exif) or "camera", *(form.format(round(value, 2)) for value, form in numbers if value)]
+    return re.sub(r"[^a-z0-9.]+", "-", " ".join(words).lower()).strip("-.")[:64] or "camera"

@@ -1,0 +1,129 @@
+"""A camera drafted from EXIF: the real focal length or none, and never a number nobody vouches for."""
+
+import random
+import re
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from service.inference.drafting import Draft, draft_camera
+from service.inference.exif import Exif, read_exif
+from service.storage.cameras import NAME_PATTERN
+from tests.inference.photographs import ExifValue, corners, exif_of, jpeg, png, tiff, webp, with_exif
+
+MAKE, MODEL = 271, 272
+F_NUMBER, FOCAL, SUBJECT, WIDTH, FOCAL_35, ZOOM, LENS = 0x829D, 0x920A, 0x9206, 0xA002, 0xA405, 0xA404, 0xA434
+PLANE_RESOLUTION, PLANE_UNIT = 0xA20E, 0xA210
+NIKON = {MAKE: "NIKON CORPORATION", MODEL: "NIKON D200"}
+SHOT: dict[int, ExifValue] = {F_NUMBER: (28, 10), FOCAL: (350, 10), FOCAL_35: 52, WIDTH: 3872}
+D200 = Exif("NIKON CORPORATION", "NIKON D200", None, 35.0, 52.0, 2.8, None, None, 3872, None)
+
+
+def draft(width_px: int = 3872, height_px: int = 2592, **tags: Any) -> Draft:
+    return draft_camera(replace(D200, **tags), width_px, height_px)
+
+
+def said(drafted: Draft, *words: str) -> bool:
+    return any(all(word in warning for word in words) for warning in drafted.warnings)
+
+
+def test_tags_are_read_from_a_jpeg_s_exif() -> None:
+    shot = SHOT | {SUBJECT: (2000, 1000), ZOOM: (1, 1), LENS: "35mm f/2", PLANE_RESOLUTION: (4164, 1), PLANE_UNIT: 3}
+    found = read_exif(with_exif(jpeg(corners()), exif_of(NIKON, shot)))
+    assert replace(found, focal_plane_pitch_um=None) == replace(
+        D200, lens="35mm f/2", subject_distance_m=2.0, digital_zoom=1.0
+    )
+    assert found.focal_plane_pitch_um == pytest.approx(1e4 / 4164)
+
+
+@pytest.mark.parametrize("data", [b"", b"x", jpeg(corners()), png(corners()), tiff(corners()), webp(corners())])
+def test_without_exif_there_are_no_tags(data: bytes) -> None:
+    found = read_exif(data)
+    assert (found.make, found.focal_length_mm, found.f_number, found.focal_plane_pitch_um) == (None,) * 4
+
+
+@pytest.mark.parametrize("value", [(0, 1), (0, 0), (5, 0), (2**32 - 1, 1)])
+def test_a_number_that_means_unknown_is_none(value: tuple[int, int]) -> None:
+    shot = {F_NUMBER: value, SUBJECT: value, FOCAL: value, PLANE_RESOLUTION: value}
+    found = read_exif(with_exif(jpeg(corners()), exif_of({}, shot)))
+    assert (found.f_number, found.subject_distance_m, found.focal_length_mm) == (None, None, None)
+
+
+def test_a_list_of_cameras_knows_the_sensor() -> None:
+    drafted = draft()
+    assert drafted.pixel_pitch_um == pytest.approx(6.05, rel=0.01)
+    assert (drafted.name, drafted.description) == ("nikon-d200-35mm-f2.8", "NIKON D200")
+    assert (drafted.focal_length_mm, drafted.f_number, drafted.sensor_width_px) == (35.0, 2.8, 3872)
+    assert said(drafted, "crop factor")
+    assert said(drafted, "focus_distance_m is needed")
+
+
+def test_the_pixel_pitch_of_the_exif_comes_first() -> None:
+    drafted = draft(focal_plane_pitch_um=6.05)
+    assert drafted.pixel_pitch_um == 6.05
+    assert not said(drafted, "crop")
+
+
+def test_a_pitch_that_cannot_be_is_not_believed() -> None:
+    drafted = draft(focal_plane_pitch_um=300.0)
+    assert drafted.pixel_pitch_um == pytest.approx(6.05, rel=0.01)
+    assert said(drafted, "cannot be")
+
+
+def test_the_equivalent_tells_the_sensor_but_is_no_focal_length() -> None:
+    drafted = draft(make="Nobody", model="Nothing 1")
+    assert drafted.pixel_pitch_um == pytest.approx(6.05, rel=0.05)
+    assert drafted.focal_length_mm == 35.0
+    assert said(drafted, "35-mm equivalent", "rounded")
+    alone = draft(make="Nobody", model="Nothing 1", focal_length_mm=None)
+    assert (alone.focal_length_mm, alone.pixel_pitch_um) == (None, None)
+    assert said(alone, "lens.focal_length_mm is needed")
+    assert said(alone, "lens.pixel_pitch_um is needed")
+
+
+def test_a_digital_zoom_is_taken_out_of_the_equivalent_and_told() -> None:
+    zoomed = draft(make="Nobody", model="Nothing 1", focal_length_35mm=104.0, digital_zoom=2.0)
+    assert zoomed.pixel_pitch_um == pytest.approx(6.05, rel=0.05)
+    assert said(zoomed, "digital zoom")
+
+
+def test_a_file_made_small_belongs_to_the_whole_sensor() -> None:
+    drafted = draft(645, 432)
+    assert (drafted.image_width_px, drafted.sensor_width_px) == (645, 3872)
+    assert drafted.pixel_pitch_um == pytest.approx(6.05, rel=0.01)
+    assert said(drafted, "resized")
+
+
+def test_a_frame_of_another_shape_is_told() -> None:
+    assert said(draft(3872, 2178), "neither 4:3 nor 3:2")
+
+
+def test_where_it_was_focused_is_taken_with_care() -> None:
+    drafted = draft(subject_distance_m=1.5)
+    assert drafted.focus_distance_m == 1.5
+    assert said(drafted, "1.5 m", "coarse")
+    assert draft(subject_distance_m=1e9).focus_distance_m is None
+
+
+def test_without_exif_everything_is_missing_and_named() -> None:
+    drafted = draft_camera(Exif(), 640, 480)
+    assert (drafted.name, drafted.description) == ("camera", None)
+    assert (drafted.image_width_px, drafted.image_height_px, drafted.sensor_width_px) == (640, 480, 640)
+    for field in ("focus_distance_m", "lens.focal_length_mm", "lens.f_number", "lens.pixel_pitch_um"):
+        assert said(drafted, f"{field} is needed")
+
+
+@pytest.mark.parametrize("model", ["🎞", "../../x", "a" * 200, "\x00\x1b[31m", "-.-"])
+def test_any_model_makes_a_name(model: str) -> None:
+    assert re.fullmatch(NAME_PATTERN, draft_camera(Exif(model=model, f_number=1.8), 4, 3).name)
+
+
+def test_damaged_exif_harms_nobody() -> None:
+    whole = with_exif(jpeg(corners(8, 8)), exif_of(NIKON, SHOT))
+    draw = random.Random(7)
+    for _ in range(300):
+        damaged = bytearray(whole)
+        for _ in range(draw.randint(1, 12)):
+            damaged[draw.randrange(len(whole))] = draw.randrange(256)
+        draft_camera(read_exif(bytes(damaged[: draw.randint(1, len(whole))])), 8, 8)
