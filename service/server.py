@@ -2,6 +2,7 @@
 
 import asyncio
 import socket
+import sys
 from typing import cast
 
 import h11
@@ -16,6 +17,7 @@ from service.memory import keep_freed_memory
 
 GRACE_S = 1.0
 BACKLOG = 2048
+MOST_HEADER_BYTES = 65_536
 
 
 class PortTakenError(OSError):
@@ -30,6 +32,14 @@ class MalformedRequest(BadRequest):
     title = "Malformed request"
 
 
+class HeadersTooLarge(BadRequest):
+    """The headers alone are larger than anybody's need."""
+
+    status = 431
+    code = "headers-too-large"
+    title = "Headers too large"
+
+
 class DeadlineProtocol(H11Protocol):
     """HTTP/1.1 whose requests must have come whole by a deadline; a connection may not dawdle for ever.
 
@@ -39,6 +49,7 @@ class DeadlineProtocol(H11Protocol):
 
     deadline_s: float
     _clock: asyncio.TimerHandle | None = None
+    _is_refused = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(cast(asyncio.Transport, transport))
@@ -49,6 +60,8 @@ class DeadlineProtocol(H11Protocol):
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
+        if self._is_refused:
+            return
         super().data_received(data)
         if not self._is_receiving():
             self._stop_clock()
@@ -57,7 +70,11 @@ class DeadlineProtocol(H11Protocol):
 
     def send_400_response(self, msg: str) -> None:
         """Answer what is no HTTP in the service's own form, and close."""
-        self._refuse(MalformedRequest(msg))
+        cause = sys.exception()
+        if isinstance(cause, h11.RemoteProtocolError) and cause.error_status_hint == HeadersTooLarge.status:
+            self._refuse(HeadersTooLarge(f"The request line and headers may have at most {MOST_HEADER_BYTES} bytes."))
+        else:
+            self._refuse(MalformedRequest(msg))
 
     def _is_receiving(self) -> bool:
         has_part_of_headers = self.conn.their_state is h11.IDLE and bool(self.conn.trailing_data[0])
@@ -83,6 +100,7 @@ class DeadlineProtocol(H11Protocol):
             self.transport.close()
 
     def _refuse(self, error: CamindError) -> None:
+        """Answer and close; what still comes is thrown away for a moment, for a reset would take the answer along."""
         body = problem(error).model_dump_json(exclude_none=True).encode()
         headers = [
             ("Content-Type", PROBLEM_TYPE),
@@ -93,7 +111,10 @@ class DeadlineProtocol(H11Protocol):
         if self.conn.our_state is h11.IDLE:
             for event in (response, h11.Data(data=body), h11.EndOfMessage()):
                 self.transport.write(self.conn.send(event) or b"")
-        self.transport.close()
+        self._is_refused = True
+        self._stop_clock()
+        self._clock = self.loop.call_later(GRACE_S, self.transport.close)
+        self.transport.write_eof()
 
 
 class StoppingServer(uvicorn.Server):
@@ -130,6 +151,7 @@ def serve(app: FastAPI, settings: Settings, listener: socket.socket) -> bool:
     config = uvicorn.Config(
         app,
         http=protocol,
+        h11_max_incomplete_event_size=MOST_HEADER_BYTES,
         ws="none",
         log_config=None,
         access_log=False,

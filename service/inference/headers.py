@@ -19,13 +19,17 @@ PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 EXIF_SIGNATURE = b"Exif\x00\x00"
 HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"mif1"})
 JPEG_MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
+JPEG_FILL = re.compile(rb"\xff*(?=\xff)")
 JPEG_END, JPEG_SCAN, JPEG_APP1 = 0xD9, 0xDA, 0xE1
 JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 JPEG_BARE = frozenset({0x01, 0xD8, *range(0xD0, 0xD8)})
 TIFF_WIDTH, TIFF_HEIGHT, TIFF_BITS, TIFF_ORIENTATION, TIFF_SAMPLE_FORMAT = 256, 257, 258, 274, 339
 TIFF_STORES = ((273, 279), (324, 325))
 TIFF_TYPES = {1: "B", 3: "H", 4: "I"}
-TIFF_MAX_VALUES = 1_000_000
+TIFF_MAX_VALUES = 100_000
+# of one file: a part costs its reader time, and a scan of a jpeg costs its decoder a pass over the whole picture
+MOST_PARTS = 20_000
+MOST_SCANS = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,10 +78,18 @@ def cut_off(kind: str) -> InvalidImage:
     return InvalidImage(f"The {kind} file is cut off: it ends before the picture does.")
 
 
+def _too_many_parts(kind: str) -> InvalidImage:
+    return InvalidImage(f"The {kind} file has more than {MOST_PARTS} parts: store it anew.")
+
+
 def _jpeg(data: bytes) -> Header:
     size: tuple[int, int] | None = None
     orientation = 1
+    scans = 0
     for marker, payload in _jpeg_segments(data):
+        scans += marker == JPEG_SCAN
+        if scans > MOST_SCANS:
+            raise InvalidImage(f"The jpeg file has more than {MOST_SCANS} scans: store it as a baseline jpeg.")
         if marker in JPEG_FRAMES and size is None:
             height, width = struct.unpack_from(">HH", payload, 1)
             size = (width, height)
@@ -91,9 +103,9 @@ def _jpeg(data: bytes) -> Header:
 def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
     """Every marker with its payload up to the end marker, which a whole file has after its last scan."""
     at = 2
-    while True:
-        while data[at] == 0xFF and data[at + 1] == 0xFF:
-            at += 1
+    for _ in range(MOST_PARTS):
+        filled = JPEG_FILL.match(data, at)
+        at = filled.end() if filled else at
         if data[at] != 0xFF:
             raise InvalidImage("The jpeg file is damaged: no marker where one must be.")
         marker, at = data[at + 1], at + 2
@@ -109,6 +121,7 @@ def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
             if found is None:
                 raise cut_off("jpeg")
             at = found.start()
+    raise _too_many_parts("jpeg")
 
 
 def _png(data: bytes) -> Header:
@@ -125,8 +138,7 @@ def _png(data: bytes) -> Header:
 def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
     """Every chunk up to the last, each with the checksum it states."""
     at = len(PNG_SIGNATURE)
-    name = b""
-    while name != b"IEND":
+    for _ in range(MOST_PARTS):
         length, name = struct.unpack_from(">I4s", data, at)
         end = at + 8 + length
         (checksum,) = struct.unpack_from(">I", data, end)
@@ -134,6 +146,9 @@ def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
             raise InvalidImage(f"The png file is damaged: its {name.decode('latin-1')!r} part fails its checksum.")
         yield name, data[at + 8 : end] if name in (b"IHDR", b"eXIf") else b""
         at = end + 4
+        if name == b"IEND":
+            return
+    raise _too_many_parts("png")
 
 
 def _webp(data: bytes) -> Header:
@@ -143,12 +158,16 @@ def _webp(data: bytes) -> Header:
     size: tuple[int, int] | None = None
     orientation = 1
     at = 12
-    while at + 8 <= length + 8:
+    for _ in range(MOST_PARTS):
+        if at > length:
+            break
         name, chunk = struct.unpack_from("<4sI", data, at)
         size = size or _webp_size(name, data[at + 8 : at + 18])
         if name == b"EXIF":
             orientation = _exif_orientation(data[at + 8 : at + 8 + chunk].removeprefix(EXIF_SIGNATURE))
         at += 8 + chunk + chunk % 2
+    else:
+        raise _too_many_parts("webp")
     if size is None:
         raise InvalidImage("The webp file holds no picture.")
     return Header("webp", *size, orientation)

@@ -42,10 +42,11 @@ DECODE_FLAGS = cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_OR
 
 @dataclass(frozen=True, slots=True)
 class ImageLimits:
-    """The most that is accepted, in bytes of the file and in pixels of the picture."""
+    """The most that is accepted: bytes of the file, pixels of the picture, and its longer side over its shorter."""
 
     max_bytes: int = 32 * 2**20
     max_pixels: int = 64_000_000
+    max_aspect: float = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,15 +124,17 @@ def _read(data: bytes, limits: ImageLimits) -> tuple[Kind, NDArray[np.uint8], in
     return kind, stored, orientation
 
 
-def _require_pixels(width_px: int, height_px: int, limits: ImageLimits) -> None:
+def _require_size(width_px: int, height_px: int, limits: ImageLimits) -> None:
     most = min(limits.max_pixels, PIXEL_CEILING)
     if width_px * height_px > most:
         raise TooLarge(f"The picture has {width_px}x{height_px} pixels, more than the {most} accepted.")
+    if max(width_px, height_px) > limits.max_aspect * min(width_px, height_px):
+        raise TooLarge(f"The picture has {width_px}x{height_px} pixels, more than {limits.max_aspect:g} to 1.")
 
 
 def _decode(data: bytes, limits: ImageLimits) -> tuple[NDArray[np.uint8], int]:
     header = read_header(data)
-    _require_pixels(header.width_px, header.height_px, limits)
+    _require_size(header.width_px, header.height_px, limits)
     try:
         pixels = cv2.imdecode(np.frombuffer(_unturned(data, header), np.uint8), DECODE_FLAGS)
     except cv2.error as exc:
@@ -169,7 +172,7 @@ def _decode_heic(data: bytes, limits: ImageLimits) -> tuple[NDArray[np.uint8], i
     try:
         picture = pi_heif.open_heif(data, convert_hdr_to_8bit=True)
         width_px, height_px = picture.size
-        _require_pixels(width_px, height_px, limits)
+        _require_size(width_px, height_px, limits)
         pixels = np.asarray(picture)
     except (ValueError, EOFError, RuntimeError, SyntaxError, OSError) as exc:
         raise InvalidImage("The heic file cannot be decoded: it is cut off or damaged.") from exc
