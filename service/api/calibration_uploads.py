@@ -132,7 +132,7 @@ class _Parts:
             if not is_there:
                 raise invalid_request([{"type": "missing", "loc": ("body", name), "msg": "Field required"}])
         if not self._has_photograph:
-            detail = "None of these files is a photograph: send JPEG, PNG, TIFF, WebP or HEIC."
+            detail = "None of these files is a photograph: send JPEG, PNG, TIFF, WebP, HEIC or DNG."
             raise InvalidImage(detail, errors=(FieldProblem(f"#/{DEFOCUSED}", detail),))
         return Form(bytes(self._settings or b""), tuple(self._pictures))
 

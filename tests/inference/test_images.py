@@ -1,6 +1,5 @@
 """The door for photographs: what is let in comes out upright and whole, what is not is refused early."""
 
-import importlib.util
 import resource
 from collections.abc import Callable
 
@@ -201,10 +200,3 @@ def test_a_small_file_of_a_huge_picture_costs_no_memory() -> None:
         read_photograph(data, "image/png")
     grown_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kb
     assert grown_kb < 20_000
-
-
-def test_heic_without_its_decoder_is_an_unsupported_kind() -> None:
-    if importlib.util.find_spec("pi_heif"):
-        pytest.skip("the decoder is installed")
-    with pytest.raises(UnsupportedKind, match="heic"):
-        read_photograph(b"\x00\x00\x00\x18ftypheic" + bytes(40))
