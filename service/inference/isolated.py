@@ -39,7 +39,7 @@ def decode_isolated(kind: str, data: bytes, max_pixels: int) -> NDArray[np.uint8
     if importlib.util.find_spec(module) is None:
         raise UnsupportedKind(f"A {kind} file needs the service's extra '{extra}', which is not installed: send JPEG.")
     memory_bytes = MEMORY_BYTES + MEMORY_BYTES_PER_PIXEL * max_pixels
-    command = [sys.executable, "-I", PROGRAM, kind, str(max_pixels), str(memory_bytes), str(CPU_S)]
+    command: list[str | Path] = [sys.executable, "-I", PROGRAM, kind, str(max_pixels), str(memory_bytes), str(CPU_S)]
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=ENVIRONMENT, cwd="/"
     ) as process:
