@@ -44,12 +44,13 @@ class DeadlineProtocol(H11Protocol):
     """HTTP/1.1 whose requests must have come whole by a deadline; a connection may not dawdle for ever.
 
     The app has the first word on slow bodies: this clock runs a little longer, and starts again while an
-    answer is being made.
+    answer is being made. An answer of which nothing is taken for that long is given up.
     """
 
     deadline_s: float
     _clock: asyncio.TimerHandle | None = None
     _is_refused = False
+    _write_clock: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(cast(asyncio.Transport, transport))
@@ -57,6 +58,7 @@ class DeadlineProtocol(H11Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._stop_clock()
+        self._stop_write_clock()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
@@ -67,6 +69,14 @@ class DeadlineProtocol(H11Protocol):
             self._stop_clock()
         elif self._clock is None:
             self._start_clock()
+
+    def pause_writing(self) -> None:
+        super().pause_writing()
+        self._watch_writing()
+
+    def resume_writing(self) -> None:
+        self._stop_write_clock()
+        super().resume_writing()
 
     def send_400_response(self, msg: str) -> None:
         """Answer what is no HTTP in the service's own form, and close."""
@@ -98,6 +108,23 @@ class DeadlineProtocol(H11Protocol):
             self._refuse(ReceiveTimeout("The request's headers came too slowly."))
         else:
             self.transport.close()
+
+    def _watch_writing(self) -> None:
+        self._stop_write_clock()
+        untaken_bytes = self.transport.get_write_buffer_size()
+        self._write_clock = self.loop.call_later(self.deadline_s, self._require_taken, untaken_bytes)
+
+    def _require_taken(self, untaken_bytes: int) -> None:
+        self._write_clock = None
+        if self.transport.get_write_buffer_size() < untaken_bytes:
+            self._watch_writing()
+        else:
+            self.transport.abort()
+
+    def _stop_write_clock(self) -> None:
+        if self._write_clock is not None:
+            self._write_clock.cancel()
+            self._write_clock = None
 
     def _refuse(self, error: CamindError) -> None:
         """Answer and close; what still comes is thrown away for a moment, for a reset would take the answer along."""

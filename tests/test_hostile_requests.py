@@ -1,15 +1,18 @@
 """Requests that mean harm, against the real process: each is refused as a problem, and the service goes on."""
 
 import json
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from model_export.served import Reply, Server, serving
+from service.opencv import cv2
 from tests.fake_calibration import SETTINGS
-from tests.inference.photographs import corners, png
+from tests.inference.photographs import corners, hostile_png, jpeg, png
 
 CAMERA: dict[str, Any] = {
     "name": "bench",
@@ -17,8 +20,10 @@ CAMERA: dict[str, Any] = {
     "image_height_px": 48,
     "focus_distance_m": 2.0,
     "k_cam_px": 6.0,
+    "intrinsics": {"fx_px": 100.0, "fy_px": 100.0, "cx_px": 32.0, "cy_px": 24.0},
 }
 JSON = {"Content-Type": "application/json"}
+PNG = {"Content-Type": "image/png"}
 FORM = {"Content-Type": "multipart/form-data; boundary=x"}
 IMAGE_LIMITS = {"CAMIND_MAX_IMAGE_BYTES": "1000000", "CAMIND_MAX_CALIBRATION_IMAGES": "4"}
 
@@ -120,4 +125,60 @@ def test_headers_without_end_are_refused_by_size(server: Server, head: bytes) ->
 
 
 def test_a_long_thin_picture_is_refused_from_its_header(server: Server) -> None:
-    refused(server.ask("POST", "/depth?camera=bench", png(corners(2, 21)), {"Content-Type": "image/png"}), 413)
+    refused(server.ask("POST", "/depth?camera=bench", png(corners(2, 21)), PNG), 413)
+
+
+def test_a_huge_picture_in_a_small_file_costs_no_memory(server: Server) -> None:
+    body = hostile_png(25_600, bits=8)
+    assert len(body) < 1_000_000
+    refused(server.ask("POST", "/depth?camera=bench", png(corners(2, 21)) + bytes(len(body)), PNG), 413)
+    before = server.peak_memory_bytes
+    for _ in range(3):
+        refused(server.ask("POST", "/depth?camera=bench", body, PNG), 413)
+    assert server.peak_memory_bytes - before < 10_000_000
+
+
+GPS_WORDS = (b"CAMIND-MEADOW", b"1999:12:31")
+GPS_DEGREES = struct.pack("<6I", 47, 1, 33, 1, 271_828, 31_415)
+
+
+def with_position(data: bytes) -> bytes:
+    """The JPEG with a GPS directory in its EXIF: where it was taken, in numbers and in words, and on which day."""
+    area, day = (word + b"\0" for word in GPS_WORDS)
+    first = struct.pack("<HHHII", 1, 0x8825, 4, 1, 26) + bytes(4)
+    entries = [
+        (1, 2, 2, b"N\0\0\0"),
+        (2, 5, 3, 0),
+        (4, 5, 3, 0),
+        (28, 2, len(area), 24),
+        (29, 2, len(day), 24 + len(area)),
+    ]
+    values = 26 + 2 + 12 * len(entries) + 4
+    directory = struct.pack("<H", len(entries))
+    for tag, kind, count, place in entries:
+        told = place if isinstance(place, bytes) else struct.pack("<I", values + place)
+        directory += struct.pack("<HHI", tag, kind, count) + told
+    exif = b"Exif\0\0II*\0" + struct.pack("<I", 8) + first + directory + bytes(4) + GPS_DEGREES + area + day
+    return data[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + data[2:]
+
+
+def test_where_a_photograph_was_taken_stays_unsaid(server: Server) -> None:
+    picture = with_position(jpeg(corners()))
+    assert all(secret in picture for secret in (*GPS_WORDS, GPS_DEGREES))
+    assert cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR) is not None
+    headers = {"Content-Type": "image/jpeg"}
+    replies = [
+        server.ask("POST", f"/depth?camera=bench&format={name}", picture, headers)
+        for name in ("png", "npy", "npz", "tiff", "ply", "preview", "json")
+    ]
+    assert {reply.status for reply in replies} == {200}
+    replies.append(server.ask("POST", "/depth?camera=bench", picture[:-50], headers))
+    replies.append(server.ask("POST", "/depth?camera=bench", with_position(jpeg(corners(48, 48))), headers))
+    replies.append(server.ask("POST", "/depth?camera=nobody", picture, headers))
+    assert [reply.status for reply in replies[-3:]] == [422, 422, 404]
+    form = part(named("settings"), json.dumps(SETTINGS).encode()) + part(named("defocused", "a.jpg"), picture)
+    queued = server.ask("POST", "/calibrate?camera=bench", form + b"--x--\r\n", {**FORM, "Prefer": "wait=30"})
+    assert queued.json()["state"] == "failed"
+    replies += [queued, server.ask("GET", "/metrics")]
+    said = server.log.encode() + b"".join(json.dumps(reply.headers).encode() + reply.body for reply in replies)
+    assert not any(secret in said for secret in (*GPS_WORDS, GPS_DEGREES, GPS_DEGREES[-8:], b"GPS", b"8.652"))
