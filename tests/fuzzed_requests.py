@@ -217,7 +217,7 @@ def _resize(random: Random, data: bytearray) -> None:
                 data[at + 5 : at + 9] = struct.pack(">HH", height & 0xFFFF, width & 0xFFFF)
     elif data[8:12] == b"WEBP" and data[12:16] == b"VP8X":
         data[24:30] = (width & 0xFFFFFF).to_bytes(3, "little") + (height & 0xFFFFFF).to_bytes(3, "little")
-    elif data[:2] in (b"II", b"MM"):
+    elif data.startswith((b"II", b"MM")):
         _set_tag(data, random.choice((256, 257, 278, 322, 323, 277, 258)), width)
     at = data.find(b"ispe")
     if at > 0:

@@ -146,18 +146,15 @@ def with_position(data: bytes) -> bytes:
     """The JPEG with a GPS directory in its EXIF: where it was taken, in numbers and in words, and on which day."""
     area, day = (word + b"\0" for word in GPS_WORDS)
     first = struct.pack("<HHHII", 1, 0x8825, 4, 1, 26) + bytes(4)
-    entries = [
-        (1, 2, 2, b"N\0\0\0"),
-        (2, 5, 3, 0),
-        (4, 5, 3, 0),
-        (28, 2, len(area), 24),
-        (29, 2, len(day), 24 + len(area)),
-    ]
-    values = 26 + 2 + 12 * len(entries) + 4
-    directory = struct.pack("<H", len(entries))
-    for tag, kind, count, place in entries:
-        told = place if isinstance(place, bytes) else struct.pack("<I", values + place)
-        directory += struct.pack("<HHI", tag, kind, count) + told
+    values = 26 + 2 + 12 * 5 + 4
+    directory = struct.pack("<HHHI", 5, 1, 2, 2) + b"N\0\0\0"
+    for tag, kind, count, place in (
+        (2, 5, 3, values),
+        (4, 5, 3, values),
+        (28, 2, len(area), values + 24),
+        (29, 2, len(day), values + 24 + len(area)),
+    ):
+        directory += struct.pack("<HHII", tag, kind, count, place)
     exif = b"Exif\0\0II*\0" + struct.pack("<I", 8) + first + directory + bytes(4) + GPS_DEGREES + area + day
     return data[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + data[2:]
 
