@@ -18,7 +18,7 @@ help: ## Say what each command means
 .venv/.dev: .venv/.service
 	@echo "Adding what development and training need ..."
 	@$(PIP) install "torch==2.13.0"
-	@$(PIP) install --editable ".[train,postgres]" --group dev
+	@$(PIP) install --editable ".[train,postgres,heic,raw]" --group dev
 	@touch $@
 
 setup: .venv/.dev ## Make .venv with the service, the development tools and torch

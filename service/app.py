@@ -110,7 +110,7 @@ def _start(app: FastAPI) -> None:
     app.state.runner = Runner(
         Calibrations(engine),
         app.state.spool,
-        ImageLimits(settings.max_image_bytes, settings.max_image_pixels),
+        ImageLimits(settings.max_image_bytes, settings.max_image_pixels, settings.max_image_aspect),
         app.state.calibrate,
     )
     app.state.runner.start()

@@ -12,7 +12,7 @@ from service.calibration.fit import Interval
 from service.calibration.report import PictureReport, Report, Role
 from service.inference.images import ImageLimits, read_stored_frame
 
-SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic"})
+SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic", ".dng"})
 REPORT = TypeAdapter(Report)
 
 

@@ -140,7 +140,7 @@ def calibrate(
     from service.inference.images import ImageLimits
 
     settings = _settings()
-    limits = ImageLimits(settings.max_image_bytes, settings.max_image_pixels)
+    limits = ImageLimits(settings.max_image_bytes, settings.max_image_pixels, settings.max_image_aspect)
     with _plain_failures():
         try:
             grid = CircleGrid(kind, rows, columns, spacing_mm, diameter_mm)

@@ -71,6 +71,9 @@ class Settings(BaseSettings):
     max_image_pixels: Annotated[int, Field(ge=1_000, le=100_000_000, description="Largest image, width x height")] = (
         24_000_000
     )
+    max_image_aspect: Annotated[
+        float, Field(ge=1, le=1_000, description="Most elongated image, longer side / shorter side")
+    ] = 10.0
     max_calibration_images: Annotated[int, Field(ge=1, le=1_000, description="Most photographs of one calibration")] = (
         100
     )

@@ -2,6 +2,7 @@
 
 import asyncio
 import socket
+import sys
 from typing import cast
 
 import h11
@@ -16,6 +17,7 @@ from service.memory import keep_freed_memory
 
 GRACE_S = 1.0
 BACKLOG = 2048
+MOST_HEADER_BYTES = 65_536
 
 
 class PortTakenError(OSError):
@@ -30,15 +32,25 @@ class MalformedRequest(BadRequest):
     title = "Malformed request"
 
 
+class HeadersTooLarge(BadRequest):
+    """The headers alone are larger than anybody's need."""
+
+    status = 431
+    code = "headers-too-large"
+    title = "Headers too large"
+
+
 class DeadlineProtocol(H11Protocol):
     """HTTP/1.1 whose requests must have come whole by a deadline; a connection may not dawdle for ever.
 
     The app has the first word on slow bodies: this clock runs a little longer, and starts again while an
-    answer is being made.
+    answer is being made. An answer of which nothing is taken for that long is given up.
     """
 
     deadline_s: float
     _clock: asyncio.TimerHandle | None = None
+    _is_refused = False
+    _write_clock: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(cast(asyncio.Transport, transport))
@@ -46,18 +58,33 @@ class DeadlineProtocol(H11Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._stop_clock()
+        self._stop_write_clock()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
+        if self._is_refused:
+            return
         super().data_received(data)
         if not self._is_receiving():
             self._stop_clock()
         elif self._clock is None:
             self._start_clock()
 
+    def pause_writing(self) -> None:
+        super().pause_writing()
+        self._watch_writing()
+
+    def resume_writing(self) -> None:
+        self._stop_write_clock()
+        super().resume_writing()
+
     def send_400_response(self, msg: str) -> None:
         """Answer what is no HTTP in the service's own form, and close."""
-        self._refuse(MalformedRequest(msg))
+        cause = sys.exception()
+        if isinstance(cause, h11.RemoteProtocolError) and cause.error_status_hint == HeadersTooLarge.status:
+            self._refuse(HeadersTooLarge(f"The request line and headers may have at most {MOST_HEADER_BYTES} bytes."))
+        else:
+            self._refuse(MalformedRequest(msg))
 
     def _is_receiving(self) -> bool:
         has_part_of_headers = self.conn.their_state is h11.IDLE and bool(self.conn.trailing_data[0])
@@ -82,7 +109,25 @@ class DeadlineProtocol(H11Protocol):
         else:
             self.transport.close()
 
+    def _watch_writing(self) -> None:
+        self._stop_write_clock()
+        untaken_bytes = self.transport.get_write_buffer_size()
+        self._write_clock = self.loop.call_later(self.deadline_s, self._require_taken, untaken_bytes)
+
+    def _require_taken(self, untaken_bytes: int) -> None:
+        self._write_clock = None
+        if self.transport.get_write_buffer_size() < untaken_bytes:
+            self._watch_writing()
+        else:
+            self.transport.abort()
+
+    def _stop_write_clock(self) -> None:
+        if self._write_clock is not None:
+            self._write_clock.cancel()
+            self._write_clock = None
+
     def _refuse(self, error: CamindError) -> None:
+        """Answer and close; what still comes is thrown away for a moment, for a reset would take the answer along."""
         body = problem(error).model_dump_json(exclude_none=True).encode()
         headers = [
             ("Content-Type", PROBLEM_TYPE),
@@ -93,7 +138,10 @@ class DeadlineProtocol(H11Protocol):
         if self.conn.our_state is h11.IDLE:
             for event in (response, h11.Data(data=body), h11.EndOfMessage()):
                 self.transport.write(self.conn.send(event) or b"")
-        self.transport.close()
+        self._is_refused = True
+        self._stop_clock()
+        self._clock = self.loop.call_later(GRACE_S, self.transport.close)
+        self.transport.write_eof()
 
 
 class StoppingServer(uvicorn.Server):
@@ -130,6 +178,7 @@ def serve(app: FastAPI, settings: Settings, listener: socket.socket) -> bool:
     config = uvicorn.Config(
         app,
         http=protocol,
+        h11_max_incomplete_event_size=MOST_HEADER_BYTES,
         ws="none",
         log_config=None,
         access_log=False,

@@ -51,6 +51,7 @@ def test_an_empty_variable_counts_as_none(monkeypatch: pytest.MonkeyPatch) -> No
         ("QUEUE_SIZE", "-1"),
         ("MAX_IMAGE_PIXELS", "0"),
         ("MAX_IMAGE_BYTES", "1e12"),
+        ("MAX_IMAGE_ASPECT", "0.5"),
         ("RECEIVE_DEADLINE_S", "inf"),
         ("CALIBRATION_RECEIVE_DEADLINE_S", "inf"),
         ("MAX_CALIBRATION_IMAGES", "0"),

@@ -27,6 +27,8 @@ FOCUSED, DEFOCUSED = "focused", "defocused"
 ROLES = (FOCUSED, DEFOCUSED)
 MAGIC_BYTES = 16
 MOST_NAME = 100
+# beside the photographs: the settings, and file inputs that nobody filled
+SPARE_PARTS = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +103,7 @@ class _Parts:
         self._folder = folder
         self._limits = limits
         self._part = _Part()
+        self._begun = 0
         self._settings: bytearray | None = None
         self._pictures: list[StoredPicture] = []
         self._has_photograph = False
@@ -129,7 +132,7 @@ class _Parts:
             if not is_there:
                 raise invalid_request([{"type": "missing", "loc": ("body", name), "msg": "Field required"}])
         if not self._has_photograph:
-            detail = "None of these files is a photograph: send JPEG, PNG, TIFF, WebP or HEIC."
+            detail = "None of these files is a photograph: send JPEG, PNG, TIFF, WebP, HEIC or DNG."
             raise InvalidImage(detail, errors=(FieldProblem(f"#/{DEFOCUSED}", detail),))
         return Form(bytes(self._settings or b""), tuple(self._pictures))
 
@@ -139,6 +142,9 @@ class _Parts:
             self._part.file.close()
 
     def _begin(self) -> None:
+        self._begun += 1
+        if self._begun > self._limits.max_pictures + SPARE_PARTS:
+            raise self._too_many()
         self._part = _Part()
 
     def _name_header(self, data: bytes, start: int, end: int) -> None:
@@ -173,7 +179,7 @@ class _Parts:
             self._take_settings(data[start:end])
             return
         if len(self._pictures) >= self._limits.max_pictures:
-            raise TooLarge(f"A calibration may have at most {self._limits.max_pictures} photographs.")
+            raise self._too_many()
         if part.size_bytes > self._limits.max_picture_bytes:
             detail = f"A photograph may have at most {self._limits.max_picture_bytes} bytes."
             raise TooLarge(detail, errors=(FieldProblem(f"#/{part.role}", detail),))
@@ -195,9 +201,12 @@ class _Parts:
         # what a browser sends for a file input that nobody filled
         if part.size_bytes or part.file_name:
             if len(self._pictures) >= self._limits.max_pictures:
-                raise TooLarge(f"A calibration may have at most {self._limits.max_pictures} photographs.")
+                raise self._too_many()
             self._has_photograph |= part.role == DEFOCUSED and sniff(part.magic) is not None
             self._pictures.append(StoredPicture(self._unused_name(part), part.role))
+
+    def _too_many(self) -> TooLarge:
+        return TooLarge(f"A calibration may have at most {self._limits.max_pictures} photographs.")
 
     def _finish(self) -> None:
         self._is_whole = True

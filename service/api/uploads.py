@@ -59,7 +59,7 @@ async def _from_form(request: Request, max_bytes: int) -> Upload:
     stream = _bounded(request, max_bytes + MULTIPART_OVERHEAD_BYTES)
     try:
         form = await MultiPartParser(request.headers, stream, max_files=1, max_fields=1).parse()
-    except (MultiPartException, KeyError) as exc:
+    except (MultiPartException, KeyError, ValueError) as exc:  # ValueError: of a charset that decodes nothing
         raise BadRequest(f"The form cannot be read ({exc}): send one file in the field '{FIELD}'.") from exc
     try:
         file = form.get(FIELD)

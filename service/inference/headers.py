@@ -12,20 +12,31 @@ from dataclasses import dataclass
 from typing import Literal
 
 from service.errors import InvalidImage, UnsupportedKind
+from service.inference.heic import primary_picture
 
-Kind = Literal["jpeg", "png", "tiff", "webp", "heic"]
+Kind = Literal["jpeg", "png", "tiff", "webp", "heic", "raw"]
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 EXIF_SIGNATURE = b"Exif\x00\x00"
 HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"mif1"})
 JPEG_MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
+JPEG_FILL = re.compile(rb"\xff*(?=\xff)")
 JPEG_END, JPEG_SCAN, JPEG_APP1 = 0xD9, 0xDA, 0xE1
 JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 JPEG_BARE = frozenset({0x01, 0xD8, *range(0xD0, 0xD8)})
 TIFF_WIDTH, TIFF_HEIGHT, TIFF_BITS, TIFF_ORIENTATION, TIFF_SAMPLE_FORMAT = 256, 257, 258, 274, 339
 TIFF_STORES = ((273, 279), (324, 325))
-TIFF_TYPES = {1: "B", 3: "H", 4: "I"}
-TIFF_MAX_VALUES = 1_000_000
+TIFF_PHOTOMETRIC, TIFF_SUB_DIRECTORIES, TIFF_DNG_VERSION = 262, 330, 50706
+# photometric interpretations of sensor values: a filter array, and the same after demosaicing
+TIFF_SENSOR = frozenset({32803, 34892})
+CR2_MARK = b"CR"
+MOST_DIRECTORIES = 16
+TIFF_TYPES = {1: "B", 3: "H", 4: "I", 13: "I"}
+TIFF_MAX_VALUES = 100_000
+TIFF_MAX_ENTRIES = 4_096
+# of one file: a part costs its reader time, and a scan of a jpeg costs its decoder a pass over the whole picture
+MOST_PARTS = 20_000
+MOST_SCANS = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,13 +66,12 @@ def sniff(data: bytes) -> Kind | None:
 
 
 def read_header(data: bytes) -> Header:
-    """The header of a JPEG, PNG, TIFF or WebP; ``UnsupportedKind`` for anything else."""
+    """The header of a photograph; ``UnsupportedKind`` for anything else. What a tiff holds may be a raw file."""
     kind = sniff(data)
-    parser = PARSERS.get(kind or "")
-    if parser is None:
-        raise UnsupportedKind("The bytes are none of JPEG, PNG, TIFF and WebP.")
+    if kind is None:
+        raise UnsupportedKind("The bytes are none of JPEG, PNG, TIFF, WebP, HEIC and DNG.")
     try:
-        header = parser(data)
+        header = PARSERS[kind](data)
     except (struct.error, IndexError) as exc:
         raise cut_off(str(kind)) from exc
     if header.width_px < 1 or header.height_px < 1:
@@ -74,10 +84,18 @@ def cut_off(kind: str) -> InvalidImage:
     return InvalidImage(f"The {kind} file is cut off: it ends before the picture does.")
 
 
+def _too_many_parts(kind: str) -> InvalidImage:
+    return InvalidImage(f"The {kind} file has more than {MOST_PARTS} parts: store it anew.")
+
+
 def _jpeg(data: bytes) -> Header:
     size: tuple[int, int] | None = None
     orientation = 1
+    scans = 0
     for marker, payload in _jpeg_segments(data):
+        scans += marker == JPEG_SCAN
+        if scans > MOST_SCANS:
+            raise InvalidImage(f"The jpeg file has more than {MOST_SCANS} scans: store it as a baseline jpeg.")
         if marker in JPEG_FRAMES and size is None:
             height, width = struct.unpack_from(">HH", payload, 1)
             size = (width, height)
@@ -91,9 +109,9 @@ def _jpeg(data: bytes) -> Header:
 def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
     """Every marker with its payload up to the end marker, which a whole file has after its last scan."""
     at = 2
-    while True:
-        while data[at] == 0xFF and data[at + 1] == 0xFF:
-            at += 1
+    for _ in range(MOST_PARTS):
+        filled = JPEG_FILL.match(data, at)
+        at = filled.end() if filled else at
         if data[at] != 0xFF:
             raise InvalidImage("The jpeg file is damaged: no marker where one must be.")
         marker, at = data[at + 1], at + 2
@@ -109,6 +127,7 @@ def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
             if found is None:
                 raise cut_off("jpeg")
             at = found.start()
+    raise _too_many_parts("jpeg")
 
 
 def _png(data: bytes) -> Header:
@@ -125,8 +144,7 @@ def _png(data: bytes) -> Header:
 def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
     """Every chunk up to the last, each with the checksum it states."""
     at = len(PNG_SIGNATURE)
-    name = b""
-    while name != b"IEND":
+    for _ in range(MOST_PARTS):
         length, name = struct.unpack_from(">I4s", data, at)
         end = at + 8 + length
         (checksum,) = struct.unpack_from(">I", data, end)
@@ -134,6 +152,9 @@ def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
             raise InvalidImage(f"The png file is damaged: its {name.decode('latin-1')!r} part fails its checksum.")
         yield name, data[at + 8 : end] if name in (b"IHDR", b"eXIf") else b""
         at = end + 4
+        if name == b"IEND":
+            return
+    raise _too_many_parts("png")
 
 
 def _webp(data: bytes) -> Header:
@@ -143,12 +164,16 @@ def _webp(data: bytes) -> Header:
     size: tuple[int, int] | None = None
     orientation = 1
     at = 12
-    while at + 8 <= length + 8:
+    for _ in range(MOST_PARTS):
+        if at > length:
+            break
         name, chunk = struct.unpack_from("<4sI", data, at)
         size = size or _webp_size(name, data[at + 8 : at + 18])
         if name == b"EXIF":
             orientation = _exif_orientation(data[at + 8 : at + 8 + chunk].removeprefix(EXIF_SIGNATURE))
         at += 8 + chunk + chunk % 2
+    else:
+        raise _too_many_parts("webp")
     if size is None:
         raise InvalidImage("The webp file holds no picture.")
     return Header("webp", *size, orientation)
@@ -168,17 +193,32 @@ def _webp_size(name: bytes, payload: bytes) -> tuple[int, int] | None:
 
 def _tiff(data: bytes) -> Header:
     directory = _TiffDirectory(data)
-    for offsets, counts in TIFF_STORES:
-        stored = zip(directory.values(offsets), directory.values(counts), strict=False)
-        if any(offset + count > len(data) for offset, count in stored):
-            raise cut_off("tiff")
+    directory.require_stored()
+    sensor = _sensor_size(data, directory)
+    if sensor is not None:
+        return Header("raw", *sensor, directory.orientation())
     if 3 in directory.values(TIFF_SAMPLE_FORMAT):
         raise UnsupportedKind("A tiff of floating-point numbers is no photograph: send 8 or 16 bits, sRGB.")
     if not set(directory.values(TIFF_BITS)) <= {8, 16}:
         raise UnsupportedKind("A tiff must have 8 or 16 bits a channel.")
-    width, height = (next(iter(directory.values(tag)), 0) for tag in (TIFF_WIDTH, TIFF_HEIGHT))
     at = directory.offset_of(TIFF_ORIENTATION)
-    return Header("tiff", width, height, directory.orientation(), at)
+    return Header("tiff", *directory.size, directory.orientation(), at)
+
+
+def _sensor_size(data: bytes, first: "_TiffDirectory") -> tuple[int, int] | None:
+    """The size of the largest picture where the file holds a sensor's values, None for any other tiff."""
+    starts = [*first.values(TIFF_SUB_DIRECTORIES)[:MOST_DIRECTORIES], *first.following(MOST_DIRECTORIES)]
+    directories = [first, *(_TiffDirectory(data, start) for start in starts)]
+    is_raw = data[8:10] == CR2_MARK or first.offset_of(TIFF_DNG_VERSION) is not None
+    if not is_raw and not any(TIFF_SENSOR & {*each.values(TIFF_PHOTOMETRIC)} for each in directories):
+        return None
+    for each in directories:
+        each.require_stored()
+    return max((each.size for each in directories), key=lambda size: size[0] * size[1])
+
+
+def _heic(data: bytes) -> Header:
+    return Header("heic", *primary_picture(data))
 
 
 def _exif_orientation(data: bytes) -> int:
@@ -190,16 +230,47 @@ def _exif_orientation(data: bytes) -> int:
 
 
 class _TiffDirectory:
-    """The first directory of a TIFF structure, the form of EXIF too."""
+    """A directory of a TIFF structure, the form of EXIF too: the first, or the one at ``start``."""
 
-    def __init__(self, data: bytes) -> None:
+    def __init__(self, data: bytes, start: int | None = None) -> None:
         if data[:4] not in (b"II*\x00", b"MM\x00*"):
             raise InvalidImage("The file has no TIFF header.")
         self._data = data
         self._order = "<" if data[:2] == b"II" else ">"
-        (start,) = self._unpack("I", 4)
+        if start is None:
+            (start,) = self._unpack("I", 4)
         (count,) = self._unpack("H", start)
-        self._entries = {self._unpack("H", at)[0]: at for at in range(start + 2, start + 2 + 12 * count, 12)}
+        if count > TIFF_MAX_ENTRIES:
+            raise InvalidImage(f"The file's TIFF directory states {count} entries.")
+        self._end = start + 2 + 12 * count
+        self._entries = {self._unpack("H", at)[0]: at for at in range(start + 2, self._end, 12)}
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, 0 where they are missing."""
+        width, height = (next(iter(self.values(tag)), 0) for tag in (TIFF_WIDTH, TIFF_HEIGHT))
+        return width, height
+
+    def following(self, most: int) -> Iterator[int]:
+        """Where the directories after this one begin, as far as they can be read."""
+        at = self._end
+        for _ in range(most):
+            try:
+                (start,) = self._unpack("I", at)
+                (count,) = self._unpack("H", start) if start else (0,)
+            except struct.error:
+                return
+            if not count:
+                return
+            yield start
+            at = start + 2 + 12 * count
+
+    def require_stored(self) -> None:
+        """Raises ``InvalidImage`` where its picture leads out of the file."""
+        for offsets, counts in TIFF_STORES:
+            stored = zip(self.values(offsets), self.values(counts), strict=False)
+            if any(offset + count > len(self._data) for offset, count in stored):
+                raise cut_off("tiff")
 
     def _unpack(self, form: str, at: int) -> tuple[int, ...]:
         return struct.unpack_from(self._order + form, self._data, at)
@@ -230,4 +301,10 @@ class _TiffDirectory:
         return value if 1 <= value <= 8 else 1
 
 
-PARSERS: dict[str, Callable[[bytes], Header]] = {"jpeg": _jpeg, "png": _png, "tiff": _tiff, "webp": _webp}
+PARSERS: dict[Kind, Callable[[bytes], Header]] = {
+    "jpeg": _jpeg,
+    "png": _png,
+    "tiff": _tiff,
+    "webp": _webp,
+    "heic": _heic,
+}

@@ -1,7 +1,8 @@
 """The only door for photographs: bytes in, upright RGB out.
 
 Kind, size and wholeness are decided on the header, before anything is decoded. EXIF orientation is applied
-here and nowhere else; a calibration, which measures the lens, asks for the stored frame.
+here and nowhere else; a calibration, which measures the lens, asks for the stored frame. HEIC and raw files are
+decoded in a process of their own.
 """
 
 from dataclasses import dataclass
@@ -12,7 +13,8 @@ from numpy.typing import NDArray
 
 from service import PIXEL_CEILING
 from service.errors import InvalidImage, TooLarge, UnsupportedKind
-from service.inference.headers import Header, Kind, read_header, sniff
+from service.inference.headers import Header, Kind, read_header
+from service.inference.isolated import decode_isolated
 from service.opencv import cv2
 
 MEDIA_TYPES: dict[str, Kind] = {
@@ -22,6 +24,10 @@ MEDIA_TYPES: dict[str, Kind] = {
     "image/webp": "webp",
     "image/heic": "heic",
     "image/heif": "heic",
+    "image/x-adobe-dng": "raw",
+    "image/x-canon-cr2": "raw",
+    "image/x-nikon-nef": "raw",
+    "image/x-sony-arw": "raw",
 }
 UNDECLARED = frozenset({"", "application/octet-stream", "image/*"})
 
@@ -42,10 +48,11 @@ DECODE_FLAGS = cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_OR
 
 @dataclass(frozen=True, slots=True)
 class ImageLimits:
-    """The most that is accepted, in bytes of the file and in pixels of the picture."""
+    """The most that is accepted: bytes of the file, pixels of the picture, and its longer side over its shorter."""
 
     max_bytes: int = 32 * 2**20
     max_pixels: int = 64_000_000
+    max_aspect: float = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +91,7 @@ def read_photograph(data: bytes, media_type: str | None = None, limits: ImageLim
 def read_stored_frame(data: bytes, limits: ImageLimits | None = None) -> NDArray[np.uint8]:
     """The pixels [h, w, 3] RGB as the sensor had them, orientation not applied: a lens belongs to its sensor.
 
-    A HEIC comes upright all the same, for its decoder turns it. Raises as ``read_photograph`` does.
+    Raises as ``read_photograph`` does.
     """
     return _read(data, limits or ImageLimits())[1]
 
@@ -116,22 +123,27 @@ def _read(data: bytes, limits: ImageLimits) -> tuple[Kind, NDArray[np.uint8], in
         raise InvalidImage("The file is empty: send the bytes of one photograph.")
     if len(data) > limits.max_bytes:
         raise TooLarge(f"The file has {len(data)} bytes, more than the {limits.max_bytes} accepted.")
-    kind = sniff(data)
-    if kind is None:
-        raise UnsupportedKind("The bytes are none of JPEG, PNG, TIFF, WebP and HEIC.")
-    stored, orientation = _decode_heic(data, limits) if kind == "heic" else _decode(data, limits)
-    return kind, stored, orientation
+    header = read_header(data)
+    _require_size(header.width_px, header.height_px, limits)
+    if header.kind in ("heic", "raw"):
+        stored = decode_isolated(header.kind, data, min(limits.max_pixels, PIXEL_CEILING))
+        _require_size(stored.shape[1], stored.shape[0], limits)
+        if header.kind == "heic":
+            stored = _unturned_pixels(stored, header)
+    else:
+        stored = _decode(data, header)
+    return header.kind, stored, header.orientation
 
 
-def _require_pixels(width_px: int, height_px: int, limits: ImageLimits) -> None:
+def _require_size(width_px: int, height_px: int, limits: ImageLimits) -> None:
     most = min(limits.max_pixels, PIXEL_CEILING)
     if width_px * height_px > most:
         raise TooLarge(f"The picture has {width_px}x{height_px} pixels, more than the {most} accepted.")
+    if max(width_px, height_px) > limits.max_aspect * min(width_px, height_px):
+        raise TooLarge(f"The picture has {width_px}x{height_px} pixels, more than {limits.max_aspect:g} to 1.")
 
 
-def _decode(data: bytes, limits: ImageLimits) -> tuple[NDArray[np.uint8], int]:
-    header = read_header(data)
-    _require_pixels(header.width_px, header.height_px, limits)
+def _decode(data: bytes, header: Header) -> NDArray[np.uint8]:
     try:
         pixels = cv2.imdecode(np.frombuffer(_unturned(data, header), np.uint8), DECODE_FLAGS)
     except cv2.error as exc:
@@ -139,7 +151,7 @@ def _decode(data: bytes, limits: ImageLimits) -> tuple[NDArray[np.uint8], int]:
     if pixels is None or pixels.shape[:2] != (header.height_px, header.width_px):
         raise InvalidImage(f"The {header.kind} file cannot be decoded: it is damaged or of an unusual form.")
     rgb = cv2.cvtColor(_eight_bits(pixels), cv2.COLOR_BGR2RGB)
-    return np.asarray(rgb, np.uint8), header.orientation
+    return np.asarray(rgb, np.uint8)
 
 
 def _unturned(data: bytes, header: Header) -> bytes:
@@ -160,17 +172,9 @@ def _eight_bits(pixels: NDArray[Any]) -> NDArray[np.uint8]:
     return np.asarray(pixels, np.uint8)
 
 
-def _decode_heic(data: bytes, limits: ImageLimits) -> tuple[NDArray[np.uint8], int]:
-    """HEIC through the optional decoder, which turns the picture itself: the orientation left is 1."""
-    try:
-        import pi_heif
-    except ImportError as exc:
-        raise UnsupportedKind("HEIC needs the service's extra 'heic': send JPEG instead.") from exc
-    try:
-        picture = pi_heif.open_heif(data, convert_hdr_to_8bit=True)
-        width_px, height_px = picture.size
-        _require_pixels(width_px, height_px, limits)
-        pixels = np.asarray(picture)
-    except (ValueError, EOFError, RuntimeError, SyntaxError, OSError) as exc:
-        raise InvalidImage("The heic file cannot be decoded: it is cut off or damaged.") from exc
-    return _eight_bits(pixels[..., :3]), 1
+def _unturned_pixels(upright: NDArray[np.uint8], header: Header) -> NDArray[np.uint8]:
+    """The stored frame of a HEIC, whose decoder turns it."""
+    stored = turned(upright, {6: 8, 8: 6}.get(header.orientation, header.orientation))
+    if stored.shape[:2] != (header.height_px, header.width_px):
+        raise InvalidImage("The heic file's picture is not of the size that it states.")
+    return stored

@@ -134,9 +134,16 @@ def tiff(rgb: NDArray[np.uint8] | NDArray[np.uint16], orientation: int = 1, orde
     return head + stored + directory + struct.pack(order + "I", 0)
 
 
-def hostile_png(side: int = 20_000) -> bytes:
-    """A valid PNG of side x side black pixels, one bit each, in some ten kB: decoded, it takes gigabytes."""
-    rows = b"\x00" * (side * (1 + -(-side // 8)))
-    header = struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)
-    chunks = png_chunk(b"IHDR", header) + png_chunk(b"IDAT", zlib.compress(rows)) + png_chunk(b"IEND", b"")
+def hostile_png(side: int = 20_000, bits: int = 1) -> bytes:
+    """A valid PNG of side x side black pixels, whole hundreds: some hundred kB at most, and gigabytes decoded."""
+    rows = bytes(100 * (1 + -(-side * bits // 8)))
+    # rows that are packed on their own need be packed once
+    packer = zlib.compressobj(9, zlib.DEFLATED, -15)
+    packed = packer.compress(rows) + packer.flush(zlib.Z_FULL_FLUSH)
+    checksum = 1
+    for _ in range(side // 100):
+        checksum = zlib.adler32(rows, checksum)
+    pixels = b"\x78\xda" + packed * (side // 100) + b"\x03\x00" + checksum.to_bytes(4, "big")
+    header = struct.pack(">IIBBBBB", side, side, bits, 0, 0, 0, 0)
+    chunks = png_chunk(b"IHDR", header) + png_chunk(b"IDAT", pixels) + png_chunk(b"IEND", b"")
     return b"\x89PNG\r\n\x1a\n" + chunks

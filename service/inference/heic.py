@@ -1,0 +1,111 @@
+"""What a HEIC's boxes say of its primary picture: the size and the turn that its decoder applies."""
+
+import struct
+from collections.abc import Iterator
+
+from service.errors import InvalidImage
+
+MOST_BOXES = 20_000
+# where the corners of the stored picture, numbered row by row, stand upright, by EXIF orientation
+ORIENTATIONS = {
+    (0, 1, 2, 3): 1,
+    (1, 0, 3, 2): 2,
+    (3, 2, 1, 0): 3,
+    (2, 3, 0, 1): 4,
+    (0, 2, 1, 3): 5,
+    (2, 0, 3, 1): 6,
+    (3, 1, 2, 0): 7,
+    (1, 3, 0, 2): 8,
+}
+QUARTER_LEFT, TOP_TO_BOTTOM, LEFT_TO_RIGHT = (1, 3, 0, 2), (2, 3, 0, 1), (1, 0, 3, 2)
+
+Corners = tuple[int, int, int, int]
+
+
+def primary_picture(data: bytes) -> tuple[int, int, int]:
+    """Width and height as stored, and the turn to upright as an EXIF orientation; EXIF's own the standard ignores.
+
+    Raises ``InvalidImage``, and ``IndexError`` or ``struct.error`` where the bytes end inside a box.
+    """
+    top = {name: (start, end) for name, start, end in _boxes(data, 0, len(data))}
+    if b"meta" not in top:
+        raise InvalidImage("The heic file holds no picture.")
+    start, end = top[b"meta"]
+    inner = {name: (start, end) for name, start, end in _boxes(data, start + 4, end)}
+    if not {b"pitm", b"iprp"} <= inner.keys():
+        raise InvalidImage("The heic file holds no picture.")
+    if b"mdat" not in top and b"idat" not in inner:
+        raise _cut_off()
+    at = inner[b"pitm"][0]
+    primary = int.from_bytes(data[at + 4 : at + (8 if data[at] else 6)], "big")
+    width, height, corners = 0, 0, (0, 1, 2, 3)
+    for name, at in _properties(data, *inner[b"iprp"], primary):
+        if name == b"ispe":
+            width, height = struct.unpack_from(">II", data, at + 4)
+        elif name == b"clap":
+            across, across_by, down, down_by = struct.unpack_from(">4I", data, at)
+            width, height = across // max(1, across_by), down // max(1, down_by)
+        elif name == b"irot":
+            for _ in range(data[at] & 3):
+                width, height, corners = height, width, _moved(corners, QUARTER_LEFT)
+        elif name == b"imir":
+            corners = _moved(corners, LEFT_TO_RIGHT if data[at] & 1 else TOP_TO_BOTTOM)
+    orientation = ORIENTATIONS[corners]
+    return (height, width, orientation) if orientation >= 5 else (width, height, orientation)
+
+
+def _cut_off() -> InvalidImage:
+    return InvalidImage("The heic file is cut off: it ends before the picture does.")
+
+
+def _moved(corners: Corners, order: Corners) -> Corners:
+    return corners[order[0]], corners[order[1]], corners[order[2]], corners[order[3]]
+
+
+def _properties(data: bytes, start: int, end: int, item: int) -> Iterator[tuple[bytes, int]]:
+    """An item's properties in the order they apply, each with where its content begins."""
+    held: list[tuple[bytes, int]] = []
+    for name, at, stop in _boxes(data, start, end):
+        if name == b"ipco":
+            held = [(each, begins) for each, begins, _ in _boxes(data, at, stop)]
+        elif name == b"ipma":
+            for index in _associations(data, at, item):
+                if 1 <= index <= len(held):
+                    yield held[index - 1]
+
+
+def _associations(data: bytes, at: int, item: int) -> Iterator[int]:
+    """The numbers of an item's properties; the bit above them says which a reader must know."""
+    form, id_size = ">H" if data[at + 3] & 1 else ">B", 4 if data[at] else 2
+    size = struct.calcsize(form)
+    (count,) = struct.unpack_from(">I", data, at + 4)
+    at += 8
+    for _ in range(min(count, MOST_BOXES)):
+        found, links = int.from_bytes(data[at : at + id_size], "big"), data[at + id_size]
+        at += id_size + 1
+        if found == item:
+            essential = 1 << 8 * size - 1
+            for place in range(at, at + size * links, size):
+                yield struct.unpack_from(form, data, place)[0] & ~essential
+            return
+        at += size * links
+
+
+def _boxes(data: bytes, at: int, end: int) -> Iterator[tuple[bytes, int, int]]:
+    """The boxes of a stretch: name, where the content begins, where it ends."""
+    for _ in range(MOST_BOXES):
+        if at + 8 > end:
+            return
+        size, name = struct.unpack_from(">I4s", data, at)
+        start = at + 8
+        if size == 1:
+            (size,) = struct.unpack_from(">Q", data, start)
+            start += 8
+        stop = at + size if size else end
+        if stop > end:
+            raise _cut_off()
+        if stop < start:
+            raise InvalidImage("The heic file is damaged: one of its boxes has no room for its head.")
+        yield name, start, stop
+        at = stop
+    raise InvalidImage(f"The heic file has more than {MOST_BOXES} boxes.")
