@@ -13,7 +13,8 @@ CamindError
 ├── UnsupportedKind (415)      a media type or file kind that is not listed
 ├── NotAcceptable (406)        no representation fits Accept
 ├── Busy (503)                 the queue is full, or the deadline passed
-└── NotReady (503)             a part of the service is not up
+├── NotReady (503)             a part of the service is not up
+└── InsufficientStorage (507)  the disk is full
 
 Domain code raises these and knows no HTTP beyond the class; one handler turns them into problem+json.
 """
@@ -139,3 +140,9 @@ class NotReady(CamindError):
     status = 503
     code = "not-ready"
     title = "Not ready"
+
+
+class InsufficientStorage(CamindError):
+    status = 507
+    code = "insufficient-storage"
+    title = "Insufficient storage"

@@ -21,6 +21,7 @@ from service.errors import (
     Busy,
     Conflict,
     FieldProblem,
+    InsufficientStorage,
     NotFound,
     NotReady,
     PreconditionFailed,
@@ -32,6 +33,7 @@ from service.storage.cameras import CameraRecord
 
 BODY_ERRORS = (BadRequest, UnsupportedKind)
 STORE_ERRORS = (Busy, NotReady)
+WRITE_ERRORS = (*STORE_ERRORS, InsufficientStorage)
 ETAG = {"ETag": {"description": "The revision, for If-Match", "schema": {"type": "string"}}}
 LOCATION = {"Location": {"description": "The camera's path", "schema": {"type": "string"}}}
 CURVE_SPAN = 5.0
@@ -50,7 +52,7 @@ Depth = Annotated[float | None, Query(ge=0.001, le=100_000, allow_inf_nan=False,
     status_code=201,
     summary="Register a camera",
     dependencies=[Depends(require_json)],
-    responses={201: {"headers": {**LOCATION, **ETAG}}, **responses(Conflict, *BODY_ERRORS, *STORE_ERRORS)},
+    responses={201: {"headers": {**LOCATION, **ETAG}}, **responses(Conflict, *BODY_ERRORS, *WRITE_ERRORS)},
 )
 def create_camera(body: CameraCreate, cameras: CamerasDep, response: Response) -> CameraRead:
     """Register a camera from its k_cam or from its lens specs; no training is needed."""
@@ -96,7 +98,7 @@ def read_camera(name: str, cameras: CamerasDep, response: Response) -> CameraRea
     dependencies=[Depends(require_json)],
     responses={
         200: {"headers": ETAG},
-        **responses(NotFound, PreconditionFailed, *BODY_ERRORS, *STORE_ERRORS),
+        **responses(NotFound, PreconditionFailed, *BODY_ERRORS, *WRITE_ERRORS),
     },
 )
 def replace_camera(
@@ -112,7 +114,7 @@ def replace_camera(
     operation_id="deleteCamera",
     status_code=204,
     summary="Delete a camera",
-    responses=responses(NotFound, PreconditionFailed, *STORE_ERRORS),
+    responses=responses(NotFound, PreconditionFailed, *WRITE_ERRORS),
 )
 def delete_camera(name: str, cameras: CamerasDep, if_match: IfMatch = None) -> None:
     """Free the name. A camera registered under it later goes on counting revisions."""
