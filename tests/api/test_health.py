@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 from fastapi import FastAPI
+from sqlalchemy import event
 from starlette.testclient import TestClient
 
 from service.app import create_app
@@ -33,9 +34,7 @@ def test_an_old_schema_is_not_ready(client: TestClient, app: FastAPI) -> None:
 
 
 def test_a_database_that_takes_no_writes_is_not_ready(client: TestClient, app: FastAPI) -> None:
-    with app.state.engine.connect() as connection:
-        connection.exec_driver_sql("PRAGMA query_only = ON")
-        connection.rollback()
+    event.listen(app.state.engine, "checkout", lambda connection, *_: connection.execute("PRAGMA query_only = ON"))
     answer = client.get("/health/ready")
     assert answer.status_code == 503
     assert answer.json()["type"] == "urn:camind:problem:not-ready"
