@@ -18,7 +18,7 @@ from service.inference.images import ImageLimits
 from service.inference.worker import Worker
 from service.middleware import AnswerHead, BodyLimits, LimitRequests, ObserveRequests
 from service.runner import Calibrate, Runner
-from service.storage import schema
+from service.storage import backup, schema
 from service.storage.calibrations import Calibrations
 from service.storage.engine import open_engine
 from service.storage.keys import Keys
@@ -84,11 +84,13 @@ def _add_middleware(app: FastAPI, settings: Settings) -> None:
 
 @asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
-    await asyncio.to_thread(_start, app)
-    try:
-        yield
-    finally:
-        await asyncio.to_thread(_stop, app)
+    settings: Settings = app.state.settings
+    with backup.using(settings.effective_database_url):
+        await asyncio.to_thread(_start, app)
+        try:
+            yield
+        finally:
+            await asyncio.to_thread(_stop, app)
 
 
 def _start(app: FastAPI) -> None:

@@ -48,7 +48,11 @@ def serve(
     port: Annotated[int | None, typer.Option(help="TCP port, 0 for any. [default: 8000]")] = None,
     model: Annotated[Path | None, typer.Option(help="Model folder. [default: the shipped model]")] = None,
 ) -> None:
-    """Answer requests until stopped. Everything else is set by CAMIND_* variables."""
+    """Answer requests until stopped. Everything else is set by CAMIND_* variables.
+
+    Exit codes: 0 after SIGTERM or SIGINT, once what was asked is answered; 143 or 130 where a second one did not wait
+    for that; 1 where it cannot start (the address, the model, the database); 2 for a wrong setting.
+    """
     settings = _settings(host=host, port=port, model_dir=model)
     from service import logs, server
     from service.app import create_app
@@ -59,7 +63,9 @@ def serve(
         listener = server.bind(settings.host, settings.port)
         load_model_folder(settings.served_model_dir)
         if settings.is_database_embedded:
-            _migrated(settings).dispose()
+            _require_sound(settings)
+            with _migrated(settings):
+                pass
         if settings.wants_keys:
             _require_key(settings)
     typer.echo(f"camind on http://{settings.host}:{listener.getsockname()[1]}", err=True)
@@ -74,9 +80,44 @@ def migrate() -> None:
     """Bring the database to the newest schema."""
     from service.storage import schema
 
-    with _plain_failures():
-        engine = _migrated(_settings())
+    with _plain_failures(), _migrated(_settings()) as engine:
         typer.echo(f"The database is at {schema.current_revision(engine)}.")
+
+
+@app.command(name="backup")
+def back_up(
+    file: Annotated[Path, typer.Argument(help="File to write", dir_okay=False)],
+    force: Annotated[bool, typer.Option("--force", help="Overwrite it if it is there")] = False,
+) -> None:
+    """Copy the SQLite database to a file, whole and checked; a service may go on using it.
+
+    Photographs that wait to be calibrated are not in it.
+    """
+    from service.storage.backup import backup, using
+
+    settings = _settings()
+    database = _database_file(settings)
+    with _plain_failures(), using(settings.effective_database_url):
+        contents = backup(database, file, is_forced=force)
+    typer.echo(f"{file} holds {contents}")
+
+
+@app.command()
+def restore(
+    file: Annotated[Path, typer.Argument(help="What `camind backup` wrote", dir_okay=False)],
+) -> None:
+    """Put a backup in the SQLite database's place, at the newest schema; no service may use it meanwhile.
+
+    The database that was there is kept beside it under a dated name.
+    """
+    from service.storage.backup import restore as put_back
+
+    database = _database_file(_settings())
+    with _plain_failures():
+        contents, kept = put_back(file, database)
+    typer.echo(f"{database} holds {contents}")
+    if kept is not None:
+        typer.echo(f"What was there before is {kept}")
 
 
 @app.command()
@@ -153,8 +194,8 @@ def calibrate(
     if register is not None:
         from service.storage.cameras import Cameras
 
-        with _plain_failures():
-            record = Cameras(_ready_engine(), owner).store_calibrated(register, report.result.to_camera())
+        with _plain_failures(), _ready_engine() as engine:
+            record = Cameras(engine, owner).store_calibrated(register, report.result.to_camera())
         typer.echo(f"stored as {record.name}, revision {record.revision}")
 
 
@@ -170,8 +211,8 @@ def seed_cameras(owner: Annotated[str, typer.Option(help=OWNER_HELP)] = LOCAL) -
     from service.storage.cameras import Cameras
     from service.storage.seeds import seed
 
-    with _plain_failures():
-        names = seed(Cameras(_ready_engine(), owner))
+    with _plain_failures(), _ready_engine() as engine:
+        names = seed(Cameras(engine, owner))
     typer.echo("\n".join(names) if names else "Every seed is there already.")
 
 
@@ -185,8 +226,8 @@ def list_cameras(owner: Annotated[str, typer.Option(help=OWNER_HELP)] = LOCAL) -
         size = f"{camera.image_width_px}x{camera.image_height_px}"
         return f"{record.name}\tr{record.revision}\t{camera.k_cam_px:.4g} px\t{camera.focus_distance_m:g} m\t{size}"
 
-    with _plain_failures():
-        cameras, after, has_more = Cameras(_ready_engine(), owner), None, True
+    with _plain_failures(), _ready_engine() as engine:
+        cameras, after, has_more = Cameras(engine, owner), None, True
         while has_more:
             records, has_more = cameras.page(100, after)
             for record in records:
@@ -213,8 +254,8 @@ def create_key(
     if unknown:
         raise _failure(f"There is no scope {', '.join(unknown)}: take {', '.join(SCOPES)}.", WRONG_USE)
     expires_at = None if days is None else datetime.now(UTC) + timedelta(days=days)
-    with _plain_failures():
-        key, text = Keys(_ready_engine()).create(name, owner or name, scopes, expires_at)
+    with _plain_failures(), _ready_engine() as engine:
+        key, text = Keys(engine).create(name, owner or name, scopes, expires_at)
     until = f"until {key.expires_at:%Y-%m-%d %H:%M} UTC" if key.expires_at else "until it is revoked"
     typer.echo(f"Key {key.id} for {key.owner}: {', '.join(scopes)}; good {until}. It is shown this once:", err=True)
     typer.echo(text)
@@ -236,8 +277,8 @@ def list_keys() -> None:
         dates = f"expires {moment(key.expires_at)}\tused {moment(key.last_used_at)}"
         return f"{key.id}\t{key.name}\t{key.owner}\t{scopes}\t{state}\t{dates}"
 
-    with _plain_failures():
-        for key in Keys(_ready_engine()).every():
+    with _plain_failures(), _ready_engine() as engine:
+        for key in Keys(engine).every():
             typer.echo(line(key))
 
 
@@ -246,8 +287,8 @@ def revoke_key(key_id: Annotated[str, typer.Argument(help="As `camind keys list`
     """Refuse a key from now on; what it made stays with its owner."""
     from service.storage.keys import Keys
 
-    with _plain_failures():
-        key = Keys(_ready_engine()).revoke(key_id)
+    with _plain_failures(), _ready_engine() as engine:
+        key = Keys(engine).revoke(key_id)
     typer.echo(f"Key {key.id} ({key.name}) is refused from now on.")
 
 
@@ -259,37 +300,68 @@ def _settings(**overrides: object) -> Settings:
 
 
 def _require_key(settings: Settings) -> None:
-    from service.storage.engine import open_engine
     from service.storage.keys import Keys
 
-    if not Keys(open_engine(settings.effective_database_url)).has_good():
-        raise _failure(
-            f"Requests to {settings.host} need an API key, and there is none: make one with `camind keys create NAME`, "
-            "or set CAMIND_API_KEYS=off to let everybody in.",
-            WRONG_USE,
-        )
+    with _opened(settings) as engine:
+        if not Keys(engine).has_good():
+            raise _failure(
+                f"Requests to {settings.host} need an API key, and there is none: make one with `camind keys create "
+                "NAME`, or set CAMIND_API_KEYS=off to let everybody in.",
+                WRONG_USE,
+            )
 
 
-def _migrated(settings: Settings) -> Engine:
-    from service.storage import schema
+@contextmanager
+def _opened(settings: Settings) -> Iterator[Engine]:
+    """The configured database, which nobody restores meanwhile."""
+    from service.storage.backup import using
     from service.storage.engine import open_engine
 
-    engine = open_engine(settings.effective_database_url)
-    schema.upgrade(engine)
-    return engine
+    with using(settings.effective_database_url):
+        engine = open_engine(settings.effective_database_url)
+        try:
+            yield engine
+        finally:
+            engine.dispose()
 
 
-def _ready_engine() -> Engine:
+@contextmanager
+def _migrated(settings: Settings) -> Iterator[Engine]:
+    from service.storage import schema
+
+    with _opened(settings) as engine:
+        schema.upgrade(engine)
+        yield engine
+
+
+@contextmanager
+def _ready_engine() -> Iterator[Engine]:
     """The configured database, at the newest schema; one that others share is not migrated in passing."""
     from service.storage import schema
-    from service.storage.engine import open_engine
 
     settings = _settings()
-    if settings.is_database_embedded:
-        return _migrated(settings)
-    engine = open_engine(settings.effective_database_url)
-    schema.require_head(engine)
-    return engine
+    with _migrated(settings) if settings.is_database_embedded else _opened(settings) as engine:
+        schema.require_head(engine)
+        yield engine
+
+
+def _require_sound(settings: Settings) -> None:
+    from service.storage.backup import database_file, require_sound, using
+
+    database = database_file(settings.effective_database_url)
+    if database is not None:
+        with using(settings.effective_database_url):
+            require_sound(database)
+
+
+def _database_file(settings: Settings) -> Path:
+    """The file of the configured database; PostgreSQL has commands of its own for it."""
+    from service.storage.backup import database_file
+
+    database = database_file(settings.effective_database_url)
+    if database is None:
+        raise _failure("Only an SQLite file is backed up here: use pg_dump and pg_restore for PostgreSQL.", WRONG_USE)
+    return database
 
 
 @contextmanager

@@ -91,6 +91,10 @@ class Settings(BaseSettings):
         float, Field(gt=0, le=600, description="Longest time for a request's headers, and for its body")
     ] = 30.0
 
+    drain_s: Annotated[
+        float, Field(ge=0, le=600, description="How long /health/ready says that the service stops before it does")
+    ] = 1.0
+
     log_level: Annotated[Literal["debug", "info", "warning", "error"], Field(description="Least level logged")] = "info"
     log_format: Annotated[
         Literal["console", "json"], Field(description="One event a line, for people or for machines")

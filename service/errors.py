@@ -17,7 +17,8 @@ CamindError
 ├── NotAcceptable (406)        no representation fits Accept
 ├── QuotaExceeded (429)        the API key asked too often
 ├── Busy (503)                 the queue is full, or the deadline passed
-└── NotReady (503)             a part of the service is not up
+├── NotReady (503)             a part of the service is not up
+└── InsufficientStorage (507)  the disk is full
 
 Domain code raises these and knows no HTTP beyond the class; one handler turns them into problem+json.
 """
@@ -182,3 +183,9 @@ class NotReady(CamindError):
     status = 503
     code = "not-ready"
     title = "Not ready"
+
+
+class InsufficientStorage(CamindError):
+    status = 507
+    code = "insufficient-storage"
+    title = "Insufficient storage"

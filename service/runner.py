@@ -116,10 +116,9 @@ class Runner:
         if not self._spool.acquire():
             return False
         if not self._is_ready:
-            self._recover()
+            self._calibrations.recover(self._spool.id)
             self._is_ready = True
-        for calibration_id in self._calibrations.ended(self._spool.ids()):
-            self._spool.remove(calibration_id)
+        self._sweep()
         record = self._calibrations.take(self._spool.id)
         if record is None:
             return False
@@ -127,8 +126,8 @@ class Runner:
             self._spool.remove(record.id)
         return True
 
-    def _recover(self) -> None:
-        self._calibrations.recover(self._spool.id)
+    def _sweep(self) -> None:
+        """Remove the photographs of what has ended, and of what was never received whole."""
         ids = self._spool.ids()
         for calibration_id in set(ids) - self._calibrations.live(ids):
             self._spool.remove(calibration_id)

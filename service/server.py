@@ -1,8 +1,13 @@
 """uvicorn with what it lacks: a deadline for headers that never end, and problem+json for what is no HTTP."""
 
 import asyncio
+import os
+import signal
 import socket
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
 from typing import cast
 
 import h11
@@ -18,6 +23,8 @@ from service.memory import keep_freed_memory
 GRACE_S = 1.0
 BACKLOG = 2048
 MOST_HEADER_BYTES = 65_536
+STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
+SIGNALLED = 128  # what a shell adds to the signal that ended a process
 
 
 class PortTakenError(OSError):
@@ -145,14 +152,35 @@ class DeadlineProtocol(H11Protocol):
 
 
 class StoppingServer(uvicorn.Server):
-    """Tells the app that it stops before waiting for its answers: those that wait for something end then."""
+    """Stops in order: the app says so while it still answers, then nobody is let in, then answers are finished.
 
-    def __init__(self, config: uvicorn.Config, app: FastAPI) -> None:
+    Answers that wait for something end as soon as the app knows. A second signal ends the process at once.
+    """
+
+    def __init__(self, config: uvicorn.Config, app: FastAPI, drain_s: float) -> None:
         super().__init__(config)
         self._app = app
+        self._drain_s = drain_s
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Take the signals to stop; the base class would raise them again at the end, and so not end with 0."""
+        before = {number: signal.signal(number, self.handle_exit) for number in STOP_SIGNALS}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:  # noqa: ARG002  (the base class's words)
+        if self.should_exit:
+            # nothing that was acknowledged is lost by it
+            os._exit(SIGNALLED + sig)
+        self._app.state.is_stopping = True
+        self.should_exit = True
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        self._app.state.is_stopping = True
+        await asyncio.sleep(self._drain_s)
         await super().shutdown(sockets)
 
 
@@ -185,6 +213,8 @@ def serve(app: FastAPI, settings: Settings, listener: socket.socket) -> bool:
         server_header=False,
         timeout_graceful_shutdown=int(settings.deadline_s) + 1,
     )
-    server = StoppingServer(config, app)
-    server.run(sockets=[listener])
+    server = StoppingServer(config, app, settings.drain_s)
+    # how the base class ends where the app does not start
+    with suppress(SystemExit):
+        server.run(sockets=[listener])
     return server.started

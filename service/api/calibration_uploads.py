@@ -1,6 +1,7 @@
 """The form of a calibration: settings, and photographs that go to the disk piece by piece as they come."""
 
 import re
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
@@ -15,10 +16,11 @@ from python_multipart.multipart import parse_options_header
 from service.api.calibration_schemas import SETTINGS_FIELD
 from service.api.problems import invalid_request
 from service.api.uploads import MULTIPART
-from service.errors import BadRequest, FieldProblem, InvalidImage, NotReady, TooLarge, UnsupportedKind
+from service.errors import BadRequest, FieldProblem, InvalidImage, TooLarge, UnsupportedKind
 from service.inference.headers import sniff
 from service.storage.calibrations import StoredPicture
-from service.storage.spool import picture_file, write_through
+from service.storage.disk import storing, write_through
+from service.storage.spool import picture_file
 
 if TYPE_CHECKING:
     from python_multipart.multipart import MultipartCallbacks
@@ -52,7 +54,8 @@ async def receive_form(request: Request, folder: Path, limits: FormLimits) -> Fo
     """Receive a calibration's form; its photographs are on the disk, in ``folder``, when this returns.
 
     Raises ``UnsupportedKind`` (no form), ``TooLarge``, ``InvalidImage`` (no photograph among the defocused),
-    ``BadRequest`` (a field that is missing, unknown or double, a damaged form) and ``NotReady`` (a full disk).
+    ``BadRequest`` (a field that is missing, unknown or double, a damaged form), ``InsufficientStorage`` (a full disk)
+    and ``NotReady`` (one that fails).
     """
     parts = _Parts(folder, limits)
     parser = MultipartParser(_boundary(request), parts.callbacks())
@@ -75,11 +78,10 @@ def _boundary(request: Request) -> bytes:
 
 def _write(parser: MultipartParser, chunk: bytes) -> None:
     try:
-        parser.write(chunk)
+        with storing():
+            parser.write(chunk)
     except FormParserError as exc:
         raise BadRequest(f"The form cannot be read ({exc}).") from exc
-    except OSError as exc:
-        raise NotReady("The photographs cannot be stored: the service's log says why.") from exc
 
 
 @dataclass(slots=True)
@@ -139,7 +141,9 @@ class _Parts:
     def close(self) -> None:
         """Close what a form that broke off left open."""
         if self._part.file is not None:
-            self._part.file.close()
+            # a full disk does not take what is left in the buffer either
+            with suppress(OSError):
+                self._part.file.close()
 
     def _begin(self) -> None:
         self._begun += 1

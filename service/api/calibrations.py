@@ -31,6 +31,7 @@ from service.errors import (
     BadRequest,
     Busy,
     Conflict,
+    InsufficientStorage,
     InvalidImage,
     KeyReused,
     NotFound,
@@ -44,6 +45,7 @@ from service.storage.idempotency import once_of
 from service.storage.spool import Spool
 
 STORE_ERRORS = (Busy, NotReady)
+WRITE_ERRORS = (*STORE_ERRORS, InsufficientStorage)
 LOOK_S = 0.2
 RETRY_AFTER_S = 30
 HEADERS = {
@@ -77,7 +79,7 @@ FoundDep = Annotated[CalibrationRecord, Depends(_find)]
     responses={
         200: {"model": CalibrationRead, "description": "It ended within the wait", "headers": HEADERS},
         202: {"description": "It is queued", "headers": HEADERS},
-        **responses(BadRequest, InvalidImage, KeyReused, TooLarge, UnsupportedKind, *STORE_ERRORS),
+        **responses(BadRequest, InvalidImage, KeyReused, TooLarge, UnsupportedKind, *WRITE_ERRORS),
     },
     openapi_extra={
         "requestBody": {
@@ -193,7 +195,7 @@ def plot_calibration(record: FoundDep) -> Response:
     operation_id="cancelCalibration",
     status_code=204,
     summary="Cancel a calibration",
-    responses=responses(NotFound, *STORE_ERRORS),
+    responses=responses(NotFound, *WRITE_ERRORS),
 )
 def cancel_calibration(
     calibration_id: CalibrationId, calibrations: CalibrationsDep, spool: SpoolDep, runner: RunnerDep

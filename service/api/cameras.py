@@ -24,6 +24,7 @@ from service.errors import (
     Busy,
     Conflict,
     FieldProblem,
+    InsufficientStorage,
     InvalidImage,
     KeyReused,
     NotFound,
@@ -42,6 +43,7 @@ from service.storage.idempotency import once_of
 
 BODY_ERRORS = (BadRequest, UnsupportedKind)
 STORE_ERRORS = (Busy, NotReady)
+WRITE_ERRORS = (*STORE_ERRORS, InsufficientStorage)
 ETAG = {"ETag": {"description": "The revision, for If-Match", "schema": {"type": "string"}}}
 LOCATION = {"Location": {"description": "The camera's path", "schema": {"type": "string"}}}
 CURVE_SPAN = 5.0
@@ -62,7 +64,7 @@ Depth = Annotated[float | None, Query(ge=0.001, le=100_000, allow_inf_nan=False,
     dependencies=[Depends(require_json)],
     responses={
         201: {"headers": {**LOCATION, **ETAG}},
-        **responses(Conflict, *BODY_ERRORS, KeyReused, *STORE_ERRORS),
+        **responses(Conflict, *BODY_ERRORS, KeyReused, *WRITE_ERRORS),
     },
 )
 def create_camera(
@@ -125,7 +127,7 @@ def read_camera(name: str, cameras: CamerasDep, response: Response) -> CameraRea
     dependencies=[Depends(require_json)],
     responses={
         200: {"headers": ETAG},
-        **responses(NotFound, PreconditionFailed, *BODY_ERRORS, *STORE_ERRORS),
+        **responses(NotFound, PreconditionFailed, *BODY_ERRORS, *WRITE_ERRORS),
     },
 )
 def replace_camera(
@@ -141,7 +143,7 @@ def replace_camera(
     operation_id="deleteCamera",
     status_code=204,
     summary="Delete a camera",
-    responses=responses(NotFound, PreconditionFailed, *STORE_ERRORS),
+    responses=responses(NotFound, PreconditionFailed, *WRITE_ERRORS),
 )
 def delete_camera(name: str, cameras: CamerasDep, if_match: IfMatch = None) -> None:
     """Free the name. A camera registered under it later goes on counting revisions."""

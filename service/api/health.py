@@ -41,8 +41,10 @@ async def read_liveness() -> Live:
     responses=responses(NotReady, Busy),
 )
 def read_readiness(request: Request) -> Ready:
-    """200 when the model is warmed up, the database takes writes, and its schema is the newest."""
+    """200 when the model is warmed up, the database takes writes, and its schema is the newest; until a stop begins."""
     state = request.app.state
+    if state.is_stopping:
+        raise NotReady("The service is stopping.")
     if not getattr(state, "is_warm", False):
         raise NotReady("The model is not warmed up yet: ask again in a few seconds.")
     require_head(state.engine)

@@ -81,7 +81,11 @@ EXAMPLES: dict[str, tuple[str, tuple[FieldProblem, ...]]] = {
     "not-acceptable": ("No format fits Accept: text/csv.", ()),
     "receive-timeout": ("The request body did not arrive within 30 s.", ()),
     "busy": ("16 images wait already: try again in a second.", ()),
-    "not-ready": ("The database cannot be written to.", ()),
+    "not-ready": ("The database takes no writes.", ()),
+    "insufficient-storage": (
+        "The database's disk is full and nothing was stored: try again when there is room.",
+        (),
+    ),
     "internal-error": ("Something went wrong here; the log has it under this X-Request-Id.", ()),
 }
 

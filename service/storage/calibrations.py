@@ -158,12 +158,6 @@ class Calibrations:
         with reading(self._engine) as session:
             return set(session.exec(query))
 
-    def ended(self, ids: Sequence[str]) -> set[str]:
-        """Those of the ids that have ended; an id that is not stored is not among them."""
-        query = select(CalibrationRow.id).where(col(CalibrationRow.id).in_(ids), col(CalibrationRow.state).not_in(LIVE))
-        with reading(self._engine) as session:
-            return set(session.exec(query))
-
     def take(self, spool: str) -> CalibrationRecord | None:
         """The spool's next in line, now running; None where nothing waits, which costs no lock."""
         if not self.waiting(spool):

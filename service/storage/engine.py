@@ -5,22 +5,24 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sqlalchemy import Connection, Engine, create_engine, event, make_url
-from sqlalchemy.exc import InternalError, OperationalError, ProgrammingError
+from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url
+from sqlalchemy.exc import DatabaseError, DataError, IntegrityError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from sqlalchemy.pool import ConnectionPoolEntry
 from sqlmodel import Session
 
-from service.errors import Busy, NotReady
+from service.errors import Busy, CamindError, InsufficientStorage, NotReady
 
 BUSY_TIMEOUT_MS = 5_000
 POOL_TIMEOUT_S = 5.0
 # older ones can corrupt a database when two connections write and checkpoint at the same instant
 FIRST_SAFE_WAL = (3, 51, 3)
 IS_WRITE = "camind_is_write"
+SQLITE_DAMAGED = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+POSTGRESQL_DISK_FULL = "53100"
 
 
-def open_engine(database_url: str) -> Engine:
+def open_engine(database_url: str | URL) -> Engine:
     """An engine for the URL; the folder of an SQLite file is made. Nothing is connected yet."""
     url = make_url(database_url)
     if url.get_backend_name() != "sqlite":
@@ -49,7 +51,8 @@ def reading(engine: Engine) -> Iterator[Session]:
 def writing(engine: Engine) -> Iterator[Session]:
     """A session that writes: the lock is taken at its begin, and it is committed whole or not at all.
 
-    Raises ``Busy`` or ``NotReady`` where the database does not answer; ``IntegrityError`` passes through.
+    Raises ``Busy`` or ``NotReady`` where the database does not answer, and ``InsufficientStorage`` where its disk is
+    full; ``IntegrityError`` passes through.
     """
     with _translated(), Session(engine.execution_options(**{IS_WRITE: True})) as session, session.begin():
         yield session
@@ -57,8 +60,15 @@ def writing(engine: Engine) -> Iterator[Session]:
 
 def require_writable(engine: Engine) -> None:
     """Raise ``NotReady`` where the database takes no writes: a full disk, a read-only file or replica."""
-    with writing(engine) as session:
-        session.connection().exec_driver_sql("UPDATE cameras SET revision = revision WHERE id = -1")
+    try:
+        with writing(engine) as session:
+            session.connection().exec_driver_sql("UPDATE cameras SET revision = revision WHERE id = -1")
+            if engine.dialect.name == "sqlite":
+                # the journal of a change needs room, though the change is taken back
+                session.connection().exec_driver_sql("UPDATE alembic_version SET version_num = version_num")
+                session.rollback()
+    except InsufficientStorage as exc:
+        raise NotReady(exc.detail) from exc
 
 
 def _prepare_sqlite(connection: sqlite3.Connection, _: ConnectionPoolEntry) -> None:
@@ -84,7 +94,20 @@ def _translated() -> Iterator[None]:
         yield
     except PoolTimeoutError as exc:
         raise Busy("Every connection to the database is taken: try again in a second.") from exc
-    except (OperationalError, InternalError, ProgrammingError) as exc:
-        if "locked" in str(exc.orig):
-            raise Busy("The database is busy: try again in a second.") from exc
-        raise NotReady("The database cannot be used: the service's log says why.") from exc
+    except DatabaseError as exc:
+        if isinstance(exc, IntegrityError | DataError):
+            raise
+        raise _unavailable(exc) from exc
+
+
+def _unavailable(error: DatabaseError) -> CamindError:
+    primary = getattr(error.orig, "sqlite_errorcode", 0) & 0xFF
+    if primary == sqlite3.SQLITE_FULL or getattr(error.orig, "sqlstate", None) == POSTGRESQL_DISK_FULL:
+        return InsufficientStorage("The database's disk is full and nothing was stored: try again when there is room.")
+    if primary in SQLITE_DAMAGED:
+        return NotReady("The database is damaged: stop the service, and `camind restore` a backup.")
+    if primary == sqlite3.SQLITE_READONLY:
+        return NotReady("The database takes no writes.")
+    if "locked" in str(error.orig):
+        return Busy("The database is busy: try again in a second.")
+    return NotReady("The database cannot be used: the service's log says why.")

@@ -16,6 +16,7 @@ from service.storage.engine import IS_WRITE, reading
 
 BASE = "base"
 HEAD = "head"
+VERSION_TABLE = "alembic_version"
 # any number, the same in every process that migrates
 LOCK = 0x63616D696E64
 
@@ -23,6 +24,11 @@ LOCK = 0x63616D696E64
 def head_revision() -> str | None:
     """The newest migration this code knows."""
     return ScriptDirectory.from_config(_config()).get_current_head()
+
+
+def known_revisions() -> set[str]:
+    """Every migration this code knows."""
+    return {script.revision for script in ScriptDirectory.from_config(_config()).walk_revisions()}
 
 
 def current_revision(engine: Engine) -> str | None:

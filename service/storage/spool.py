@@ -1,12 +1,12 @@
 """The spool: a folder for each calibration that has not ended, with its photographs under numbers of our own.
 
-One process at a time works a spool off; it is told from the spools of other machines by an id in a file.
+One process at a time works a spool off, and all that share it fill it; it is told from the spools of other machines by
+an id in a file. A folder is locked while it is filled, from before it has its name until the database knows it.
 """
 
-import fcntl
-import os
 import re
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,9 +14,12 @@ from typing import BinaryIO
 from uuid import uuid4
 
 from service.storage.calibrations import ID_PATTERN
+from service.storage.disk import storing, sync_folder, try_lock, write_through
 
 ID_FILE = "spool-id"
 LOCK_FILE = "lock"
+# far longer than it takes to name a folder that was made
+LEFT_BEHIND_AFTER_S = 60.0
 
 
 class Spool:
@@ -26,32 +29,42 @@ class Spool:
         folder.mkdir(parents=True, exist_ok=True)
         self._folder = folder
         self._lock: BinaryIO | None = None
-        self._incoming: set[str] = set()
+        self._incoming = 0
         self.id = _id_in(folder)
 
     @property
     def incoming(self) -> int:
-        """How many calibrations are being received now."""
-        return len(self._incoming)
+        """How many calibrations this process is receiving now."""
+        return self._incoming
 
     @contextmanager
     def receiving(self, calibration_id: str) -> Iterator[Path]:
-        """A new folder to be filled; it is removed again where that fails."""
-        folder = self._folder / calibration_id
-        self._incoming.add(calibration_id)
+        """A new folder to be filled; it is removed again where that fails.
+
+        Raises ``InsufficientStorage`` and ``NotReady`` where it cannot be made.
+        """
+        draft, lock = f".{calibration_id}", None
+        self._incoming += 1
         try:
-            folder.mkdir()
+            with storing():
+                (self._folder / draft).mkdir()
+                lock = try_lock(self._folder / draft / LOCK_FILE)
+                folder = (self._folder / draft).rename(self._folder / calibration_id)
             yield folder
         except BaseException:
+            self.remove(draft)
             self.remove(calibration_id)
             raise
         finally:
-            self._incoming.discard(calibration_id)
+            if lock is not None:
+                lock.close()
+            self._incoming -= 1
 
     def seal(self, calibration_id: str) -> None:
-        """Put the folder on the disk; its files were before, each with ``write_through``."""
-        _sync_folder(self._folder / calibration_id)
-        _sync_folder(self._folder)
+        """Put the folder on the disk; its files were before, each with ``write_through``. Raises as ``receiving``."""
+        with storing():
+            sync_folder(self._folder / calibration_id)
+            sync_folder(self._folder)
 
     def paths(self, calibration_id: str, count: int) -> list[Path]:
         """Where the photographs are, in the order they came in."""
@@ -63,19 +76,19 @@ class Spool:
 
     def ids(self) -> list[str]:
         """The calibrations that have a folder, but for those being received: the database may not know them yet."""
-        names = [path.name for path in self._folder.iterdir() if re.fullmatch(ID_PATTERN, path.name)]
-        return [name for name in names if name not in self._incoming]
+        return [
+            path.name
+            for path in self._folder.iterdir()
+            if re.fullmatch(ID_PATTERN, path.name) and not _is_being_filled(path)
+        ]
 
     def acquire(self) -> bool:
         """Become the one process that works this spool off; False while another is. Ends with the process."""
         if self._lock is None:
-            lock = (self._folder / LOCK_FILE).open("ab")
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                lock.close()
+            self._lock = try_lock(self._folder / LOCK_FILE)
+            if self._lock is None:
                 return False
-            self._lock = lock
+            self._remove_drafts()
         return True
 
     def release(self) -> None:
@@ -84,16 +97,17 @@ class Spool:
             self._lock.close()
             self._lock = None
 
+    def _remove_drafts(self) -> None:
+        """Remove folders whose process ended between making and naming them."""
+        for draft in self._folder.glob(".*/"):
+            with suppress(FileNotFoundError):
+                if time.time() - draft.stat().st_mtime > LEFT_BEHIND_AFTER_S:
+                    self.remove(draft.name)
+
 
 def picture_file(number: int) -> str:
     """The file name of a calibration's n-th photograph; what the user calls it is never part of a path."""
     return f"{number:04d}"
-
-
-def write_through(file: BinaryIO) -> None:
-    """Put a file's content on the disk."""
-    file.flush()
-    os.fsync(file.fileno())
 
 
 def _id_in(folder: Path) -> str:
@@ -107,13 +121,16 @@ def _id_in(folder: Path) -> str:
         with suppress(FileExistsError):
             path.hardlink_to(draft)
         draft.unlink()
-        _sync_folder(folder)
+        sync_folder(folder)
     return path.read_text()
 
 
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
+def _is_being_filled(folder: Path) -> bool:
+    """Whether a process fills it now; what once was not being filled never will be."""
     try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+        lock = try_lock(folder / LOCK_FILE, is_shared=True)
+    except FileNotFoundError:
+        return False  # it was removed meanwhile
+    if lock is not None:
+        lock.close()
+    return lock is None

@@ -1,0 +1,258 @@
+"""Copies of an SQLite database: made while services use it, and put in its place while none does.
+
+A file gets its name when it is whole, checked and on the disk: whatever ends this, what had the name before still has
+it, or the new one has.
+"""
+
+import os
+import shutil
+import sqlite3
+import stat
+import tempfile
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from sqlalchemy import URL, make_url
+
+from service.errors import NotReady
+from service.storage import schema
+from service.storage.disk import sync_folder, try_lock, write_through
+from service.storage.engine import SQLITE_DAMAGED, open_engine
+
+BUSY_TIMEOUT_S = 30.0
+# what SQLite keeps beside a database; of another database they would be played into it
+SIDE_FILES = ("-journal", "-wal", "-shm")
+
+
+class DatabaseFileError(OSError):
+    """A file that is not, or cannot become, the database; the message says which and what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Contents:
+    """What a database file holds: its schema's last migration, and how many rows by table."""
+
+    revision: str | None
+    rows: dict[str, int]
+
+    def __str__(self) -> str:
+        rows = ", ".join(f"{table} {count}" for table, count in self.rows.items())
+        return f"{rows or 'no tables'}; schema {self.revision}"
+
+
+def database_file(database_url: str) -> Path | None:
+    """The file of an SQLite database, links followed; None for one on a server or in memory."""
+    url = make_url(database_url)
+    is_file = url.get_backend_name() == "sqlite" and url.database not in (None, "", ":memory:")
+    return Path(str(url.database)).resolve() if is_file else None
+
+
+@contextmanager
+def using(database_url: str) -> Iterator[None]:
+    """Nobody restores the database meanwhile. Raises ``NotReady`` where somebody does."""
+    file = database_file(database_url)
+    if file is None:
+        yield
+        return
+    file.parent.mkdir(parents=True, exist_ok=True)
+    lock = try_lock(_lock_file(file), is_shared=True)
+    if lock is None:
+        raise NotReady(f"The database {file} is being restored: start again when that is done.")
+    with lock:
+        yield
+
+
+def require_sound(database: Path) -> None:
+    """Read the whole file, if there is one. Raises ``DatabaseFileError`` where it is damaged."""
+    damage = _damage(database) if database.exists() else None
+    if damage is not None:
+        raise DatabaseFileError(
+            f"The database {database} is damaged ({damage}): put a backup in its place with `camind restore FILE`."
+        )
+
+
+def backup(database: Path, target: Path, *, is_forced: bool = False) -> Contents:
+    """Copy the database as it is at one moment; services may go on writing to it.
+
+    Raises ``DatabaseFileError`` where there is none, where it is damaged, and where ``target`` is there already.
+    """
+    if not database.is_file():
+        raise DatabaseFileError(f"There is no database at {database}.")
+    if target.exists() and target.samefile(database):
+        raise DatabaseFileError(f"{target} is the database itself: choose another name.")
+    if target.exists() and not is_forced:
+        raise DatabaseFileError(f"{target} is there already: choose another name, or overwrite it with --force.")
+    with _draft_beside(target) as draft:
+        contents = _copied(database, draft)
+        _put_in_place(draft, target)
+    return contents
+
+
+def restore(source: Path, database: Path) -> tuple[Contents, Path | None]:
+    """Put a backup in the database's place, at the newest schema; what it holds, and where the replaced one is kept.
+
+    Raises ``DatabaseFileError`` where the backup is damaged, is none of this service's or of a later version's, and
+    while the database is used.
+    """
+    if not source.is_file():
+        raise DatabaseFileError(f"There is no backup at {source}.")
+    if database.exists() and source.samefile(database):
+        raise DatabaseFileError(f"{source} is the database itself: name a backup.")
+    with _replacing(database), _draft_beside(database) as draft:
+        _require_known(_copied(source, draft), source)
+        _migrate(draft)
+        contents = _contents(draft)
+        kept = _keep(database)
+        if kept is not None:
+            _take_owner(draft, kept)
+        _put_in_place(draft, database)
+    return contents, kept
+
+
+def _lock_file(database: Path) -> Path:
+    return database.with_name(f"{database.name}.lock")
+
+
+@contextmanager
+def _replacing(database: Path) -> Iterator[None]:
+    database.parent.mkdir(parents=True, exist_ok=True)
+    lock = try_lock(_lock_file(database))
+    if lock is None:
+        raise DatabaseFileError(f"The database {database} is in use: stop the service first.")
+    with lock:
+        for left_behind in database.parent.glob(f".{database.name}.*"):
+            left_behind.unlink()
+        yield
+
+
+@contextmanager
+def _draft_beside(target: Path) -> Iterator[Path]:
+    """An empty file that is to get the target's name, readable by its owner alone; gone afterwards if it did not."""
+    descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+    os.close(descriptor)
+    draft = Path(name)
+    try:
+        yield draft
+    finally:
+        for suffix in ("", *SIDE_FILES):
+            _beside(draft, suffix).unlink(missing_ok=True)
+
+
+def _put_in_place(draft: Path, target: Path) -> None:
+    with draft.open("rb+") as file:
+        write_through(file)
+    for suffix in SIDE_FILES:
+        _beside(target, suffix).unlink(missing_ok=True)
+    draft.replace(target)
+    sync_folder(target.parent)
+
+
+def _beside(file: Path, suffix: str) -> Path:
+    return file.with_name(file.name + suffix)
+
+
+@contextmanager
+def _opened(file: Path) -> Iterator[sqlite3.Connection]:
+    """A connection that makes no file. Raises ``DatabaseFileError`` for what SQLite cannot read or write."""
+    try:
+        connection = sqlite3.connect(
+            f"{file.absolute().as_uri()}?mode=rw", uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None
+        )
+        with closing(connection):
+            yield connection
+    except sqlite3.Error as exc:
+        raise DatabaseFileError(f"{file} cannot be used by SQLite: {exc}.") from exc
+
+
+def _copied(source: Path, draft: Path) -> Contents:
+    """Copy a database, and check the copy: what is damaged is damaged in both."""
+    with _opened(draft) as copy, _opened(source) as connection:
+        connection.backup(copy)
+        # a write-ahead log would be a second file
+        copy.execute("PRAGMA journal_mode = DELETE")
+    damage = _damage(draft)
+    if damage is not None:
+        raise DatabaseFileError(f"{source} is damaged ({damage}): nothing was changed.")
+    return _contents(draft)
+
+
+def _damage(file: Path) -> str | None:
+    """What is wrong with a database, in a line; None where all of it can be read and fits together."""
+    with _opened(file) as connection:
+        try:
+            found: str = connection.execute("PRAGMA integrity_check(1)").fetchone()[0]
+        except sqlite3.DatabaseError as exc:
+            if exc.sqlite_errorcode & 0xFF not in SQLITE_DAMAGED:
+                raise
+            found = str(exc)
+    return None if found == "ok" else found.splitlines()[-1]
+
+
+def _contents(file: Path) -> Contents:
+    with _opened(file) as connection:
+        found = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table' ORDER BY name").fetchall()
+        # the names are the migrations' own, or those of a file that is about to be refused
+        names = [name for (name,) in found if name.isidentifier() and not name.startswith("sqlite_")]
+        revision = None
+        if schema.VERSION_TABLE in names:
+            names.remove(schema.VERSION_TABLE)
+            row = connection.execute(f"SELECT version_num FROM {schema.VERSION_TABLE}").fetchone()  # noqa: S608
+            revision = row and row[0]
+        counts = {name: connection.execute(f'SELECT count(*) FROM "{name}"').fetchone()[0] for name in names}  # noqa: S608
+    return Contents(revision, counts)
+
+
+def _require_known(contents: Contents, source: Path) -> None:
+    if contents.revision is None:
+        raise DatabaseFileError(f"{source} is no backup of this service's: it names no schema. Nothing was changed.")
+    if contents.revision not in schema.known_revisions():
+        raise DatabaseFileError(
+            f"{source} is at schema {contents.revision}, which this version does not know: nothing was changed; "
+            "restore it with the version that made it, or a later one."
+        )
+
+
+def _migrate(file: Path) -> None:
+    engine = open_engine(URL.create("sqlite", database=str(file)))
+    try:
+        schema.upgrade(engine)
+    finally:
+        engine.dispose()
+
+
+def _keep(database: Path) -> Path | None:
+    """A copy of the database under a dated name, damaged as it may be; None where there is none."""
+    if not database.exists():
+        return None
+    with suppress(DatabaseFileError), _opened(database) as connection:
+        # what a killed process left in a journal belongs to the copy
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        connection.execute("BEGIN IMMEDIATE")
+        connection.execute("ROLLBACK")
+    kept = database.with_name(f"{database.name}.replaced-{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}")
+    for suffix in SIDE_FILES:
+        if _beside(database, suffix).exists():
+            _copy_through(_beside(database, suffix), _beside(kept, suffix))
+    with _draft_beside(kept) as draft:
+        _copy_through(database, draft)
+        _take_owner(draft, database)
+        draft.replace(kept)
+    sync_folder(kept.parent)
+    return kept
+
+
+def _copy_through(source: Path, target: Path) -> None:
+    shutil.copyfile(source, target)
+    with target.open("rb+") as file:
+        write_through(file)
+
+
+def _take_owner(file: Path, model: Path) -> None:
+    """Let those use a file who may use the other one."""
+    status = model.stat()
+    file.chmod(stat.S_IMODE(status.st_mode))
+    with suppress(PermissionError):
+        os.chown(file, status.st_uid, status.st_gid)

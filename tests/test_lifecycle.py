@@ -1,0 +1,139 @@
+"""How the process begins and ends: not on a damaged database, and not before what was asked is answered."""
+
+import json
+import os
+import signal
+import sqlite3
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from model_export.served import CAMIND, Reply, Server, serving
+from tests.storage.test_backup import damage, fill
+
+DRAIN_S = 2.0
+CAMERA = {"name": "kept", "image_width_px": 4, "image_height_px": 3, "focus_distance_m": 1.0, "k_cam_px": 2.0}
+JSON = {"Content-Type": "application/json"}
+
+
+@pytest.fixture
+def server(tmp_path: Path, tiny_model_dir: Path) -> Iterator[Server]:
+    with serving(tmp_path / "data", "--model", tiny_model_dir, settings={"CAMIND_DRAIN_S": "0"}) as running:
+        yield running
+
+
+def is_listening(server: Server) -> bool:
+    try:
+        server.connect().close()
+    except ConnectionRefusedError:
+        return False
+    return True
+
+
+def _unready(server: Server) -> Reply | None:
+    reply = server.ask("GET", "/health/ready")
+    return None if reply.status == 200 else reply
+
+
+def test_it_says_that_it_stops_while_it_still_answers(tmp_path: Path, tiny_model_dir: Path) -> None:
+    with serving(tmp_path / "data", "--model", tiny_model_dir, settings={"CAMIND_DRAIN_S": str(DRAIN_S)}) as server:
+        server.process.send_signal(signal.SIGTERM)
+        started_s = time.monotonic()
+        reply = server.poll(lambda: _unready(server))
+        assert time.monotonic() - started_s < DRAIN_S
+        assert (reply.status, reply.json()["detail"]) == (503, "The service is stopping.")
+        assert server.ask("GET", "/health/live").status == 200
+        assert server.add(CAMERA) == 201
+        assert server.process.wait(timeout=30) == 0
+        assert time.monotonic() - started_s >= DRAIN_S
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_request_in_flight_is_answered_before_the_end(server: Server, number: signal.Signals) -> None:
+    body = json.dumps(CAMERA).encode()
+    head = f"POST /cameras HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"
+    with server.connect() as connection:
+        connection.sendall(head.encode() + body[:10])
+        server.poll(lambda: "camind_requests_in_progress 2" in server.ask("GET", "/metrics").body.decode())
+        server.process.send_signal(number)
+        server.poll(lambda: not is_listening(server))
+        connection.sendall(body[10:])
+        assert connection.recv(100).startswith(b"HTTP/1.1 201 ")
+    assert server.process.wait(timeout=30) == 0
+    assert "Traceback" not in server.log
+
+
+def test_a_second_signal_ends_it_at_once(server: Server) -> None:
+    with server.connect() as connection:
+        connection.sendall(b"POST /cameras HTTP/1.1\r\nHost: x\r\nContent-Length: 10\r\n\r\n{")
+        server.poll(lambda: "camind_requests_in_progress 2" in server.ask("GET", "/metrics").body.decode())
+        server.process.send_signal(signal.SIGTERM)
+        server.poll(lambda: not is_listening(server))
+        started_s = time.monotonic()
+        assert server.stop(signal.SIGTERM) == 128 + signal.SIGTERM
+        assert time.monotonic() - started_s < 5
+
+
+def refused_start(data_dir: Path, model_dir: Path) -> str:
+    """What ``camind serve`` says where it does not start."""
+    environment = {**os.environ, "CAMIND_DATA_DIR": str(data_dir)}
+    command: list[str | Path] = [CAMIND, "serve", "--port", "0", "--model", model_dir]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 1
+    return done.stderr
+
+
+@pytest.mark.parametrize("page", [0, 2])
+def test_a_damaged_database_is_not_served(tmp_path: Path, tiny_model_dir: Path, page: int) -> None:
+    database = tmp_path / "camind.sqlite3"
+    fill(database, "kept")
+    damage(database, page)
+    told = refused_start(tmp_path, tiny_model_dir)
+    assert len(told.splitlines()) == 1
+    assert str(database) in told
+    assert "camind restore" in told
+
+
+def test_an_app_that_does_not_start_ends_with_1(tmp_path: Path, tiny_model_dir: Path) -> None:
+    # the spool's folder cannot be made where a file has its name
+    (tmp_path / "calibrations").touch()
+    assert refused_start(tmp_path, tiny_model_dir).endswith("camind did not start: the log above says why.\n")
+
+
+def test_a_running_service_is_backed_up_and_not_restored(server: Server, tmp_path: Path) -> None:
+    def camind(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+        environment = {**os.environ, "CAMIND_DATA_DIR": str(tmp_path / "data")}
+        return subprocess.run([CAMIND, *arguments], env=environment, capture_output=True, text=True, check=False)
+
+    copy = tmp_path / "copy.sqlite3"
+    assert server.add(CAMERA) == 201
+    done = camind("backup", copy)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith(f"{copy} holds calibrations 0, camera_revisions 1, cameras 1; schema 20")
+    assert camind("backup", copy).returncode == 1
+    assert server.add({**CAMERA, "name": "later"}) == 201
+    refused = camind("restore", copy)
+    assert (refused.returncode, refused.stdout) == (1, "")
+    assert "stop the service first" in refused.stderr
+    assert server.ask("GET", "/cameras/later").status == 200
+    assert server.stop(signal.SIGTERM) == 0
+    restored = camind("restore", copy)
+    assert (restored.returncode, restored.stderr) == (0, "")
+    kept = Path(restored.stdout.splitlines()[1].removeprefix("What was there before is "))
+    with closing(sqlite3.connect(kept)) as connection:
+        assert connection.execute("SELECT count(*) FROM cameras").fetchone() == (2,)
+    assert [line.split("\t")[0] for line in camind("cameras", "list").stdout.splitlines()] == ["kept"]
+
+
+@pytest.mark.parametrize("command", ["backup", "restore"])
+def test_postgresql_has_its_own_commands(tmp_path: Path, command: str) -> None:
+    environment = {**os.environ, "CAMIND_DATABASE_URL": "postgresql+psycopg://nobody@/none"}
+    done = subprocess.run(
+        [CAMIND, command, tmp_path / "x"], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert "pg_dump and pg_restore" in done.stderr
