@@ -99,7 +99,10 @@ def _start(app: FastAPI) -> None:
     app.state.model = folder
     app.state.estimator = estimator
     app.state.worker = Worker(
-        slots=settings.worker_slots, queue_size=settings.queue_size, deadline_s=settings.deadline_s
+        slots=settings.worker_slots,
+        queue_size=settings.queue_size,
+        deadline_s=settings.deadline_s,
+        tell_wait=app.state.metrics.time_wait,
     )
     app.state.calibrations = Calibrations(engine)
     app.state.spool = Spool(settings.spool_dir)
@@ -110,12 +113,21 @@ def _start(app: FastAPI) -> None:
         app.state.calibrate,
     )
     app.state.runner.start()
-    app.state.metrics.in_flight.set_function(lambda: app.state.worker.in_flight)
+    app.state.metrics.watch(
+        metrics.Parts(
+            folder.manifest.name,
+            app.state.worker,
+            app.state.calibrations,
+            app.state.spool.id,
+            settings.calibration_queue_size,
+        )
+    )
     app.state.is_warm = True
 
 
 def _stop(app: FastAPI) -> None:
     app.state.is_warm = False
+    app.state.metrics.watch(None)
     app.state.runner.close()
     app.state.worker.close()
     app.state.engine.dispose()

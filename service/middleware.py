@@ -17,7 +17,7 @@ from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.api.metrics import Metrics
-from service.api.problems import problem_response
+from service.api.problems import PROBLEM_KEY, problem_response
 from service.errors import CamindError, ReceiveTimeout, TooLarge
 
 REQUEST_ID = "X-Request-Id"
@@ -84,6 +84,8 @@ class ObserveRequests:
         status = exchange.status or CLIENT_GONE
         path = getattr(scope.get("route"), "path", None)
         self._metrics.count(scope["method"], path, status, duration_s)
+        if PROBLEM_KEY in scope:
+            self._metrics.count_problem(scope[PROBLEM_KEY])
         log.info(
             "request",
             method=scope["method"],
@@ -197,6 +199,6 @@ def _camera(scope: Scope, path: str | None) -> dict[str, str]:
 
 def _hand_back(inner: MutableMapping[str, object], scope: Scope) -> None:
     """Let the outer middleware see which route answered."""
-    for key in ("route", "path_params"):
+    for key in ("route", "path_params", PROBLEM_KEY):
         if key in inner:
             scope[key] = inner[key]

@@ -2,6 +2,7 @@
 
 import asyncio
 import socket
+from collections.abc import Callable
 from typing import cast
 
 import h11
@@ -38,6 +39,7 @@ class DeadlineProtocol(H11Protocol):
     """
 
     deadline_s: float
+    count_problem: Callable[[str], None]
     _clock: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -83,6 +85,7 @@ class DeadlineProtocol(H11Protocol):
             self.transport.close()
 
     def _refuse(self, error: CamindError) -> None:
+        self.count_problem(error.code)
         body = problem(error).model_dump_json(exclude_none=True).encode()
         headers = [
             ("Content-Type", PROBLEM_TYPE),
@@ -126,7 +129,8 @@ def bind(host: str, port: int) -> socket.socket:
 def serve(app: FastAPI, settings: Settings, listener: socket.socket) -> bool:
     """Answer on the socket until told to stop; whether the app ever started."""
     keep_freed_memory()
-    protocol = type("Protocol", (DeadlineProtocol,), {"deadline_s": settings.receive_deadline_s + GRACE_S})
+    own = {"deadline_s": settings.receive_deadline_s + GRACE_S, "count_problem": app.state.metrics.count_problem}
+    protocol = type("Protocol", (DeadlineProtocol,), own)
     config = uvicorn.Config(
         app,
         http=protocol,

@@ -19,6 +19,16 @@ from tests import postgres
 from tests.inference.oracle_pair import build_oracle_pair
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--soak", action="store_true", help="the long version of tests that repeat")
+
+
+@pytest.fixture(scope="session")
+def is_soak(request: pytest.FixtureRequest) -> bool:
+    """Whether tests that repeat run their long version."""
+    return bool(request.config.getoption("--soak"))
+
+
 @pytest.fixture(scope="session")
 def tiny_model_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A model folder whose pair is real, tiny, and has a known answer."""

@@ -80,6 +80,11 @@ def test_operation_ids_are_plain_and_unique(document: dict[str, Any]) -> None:
     assert all(operation_id.isalpha() for operation_id in ids)
 
 
+def test_no_parameter_is_null(document: dict[str, Any]) -> None:
+    for name, operation in operations(document):
+        assert "'null'" not in str(operation.get("parameters")), name
+
+
 def test_the_framework_s_own_errors_are_nowhere(document: dict[str, Any]) -> None:
     assert "HTTPValidationError" not in str(document)
 

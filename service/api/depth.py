@@ -116,7 +116,8 @@ router = APIRouter(tags=["depth"])
                         "required": [FIELD],
                         "additionalProperties": False,
                         "properties": {FIELD: {"type": "string", "format": "binary"}},
-                    }
+                    },
+                    "encoding": {FIELD: {"contentType": ", ".join(IMAGE_TYPES)}},
                 },
             },
         }
