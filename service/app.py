@@ -22,6 +22,7 @@ from service.storage.calibrations import Calibrations
 from service.storage.cameras import Cameras
 from service.storage.engine import open_engine
 from service.storage.spool import Spool
+from service.tracing import Tracing
 
 DEPTH_PATH = "/depth"
 CALIBRATE_PATH = "/calibrate"
@@ -39,7 +40,10 @@ TAGS = [
 
 
 def create_app(settings: Settings, calibrate: Calibrate = calibrate) -> FastAPI:
-    """The app for these settings; nothing is opened or loaded before it starts."""
+    """The app for these settings; nothing is opened or loaded before it starts.
+
+    Raises ``SettingsError`` where they ask for traces and the extra ``otel`` is missing.
+    """
     app = FastAPIOffline(
         title="camind",
         version=version("camind"),
@@ -53,6 +57,7 @@ def create_app(settings: Settings, calibrate: Calibrate = calibrate) -> FastAPI:
     )
     app.state.settings = settings
     app.state.metrics = metrics.Metrics()
+    app.state.tracing = Tracing(settings.otlp_endpoint) if settings.otlp_endpoint else None
     app.state.calibrate = calibrate
     app.state.is_stopping = False
     _add_middleware(app, settings)
@@ -74,7 +79,7 @@ def _add_middleware(app: FastAPI, settings: Settings) -> None:
         },
     )
     app.add_middleware(AnswerHead)
-    app.add_middleware(ObserveRequests, metrics=app.state.metrics)
+    app.add_middleware(ObserveRequests, metrics=app.state.metrics, tracing=app.state.tracing)
 
 
 @asynccontextmanager
@@ -113,6 +118,8 @@ def _start(app: FastAPI) -> None:
         app.state.calibrate,
     )
     app.state.runner.start()
+    if app.state.tracing is not None:
+        app.state.tracing.start()
     app.state.metrics.watch(
         metrics.Parts(
             folder.manifest.name,
@@ -131,3 +138,5 @@ def _stop(app: FastAPI) -> None:
     app.state.runner.close()
     app.state.worker.close()
     app.state.engine.dispose()
+    if app.state.tracing is not None:
+        app.state.tracing.close()

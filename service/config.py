@@ -33,6 +33,11 @@ def default_data_dir() -> Path:
     return Path(base).expanduser() / "camind"
 
 
+def default_otlp_endpoint() -> str:
+    """Where traces go by OpenTelemetry's own variable; empty for nowhere."""
+    return os.environ.get("OTEL_EXPORTER_OTLP_ENDPOINT", "")
+
+
 class Settings(BaseSettings):
     """Everything an operator can choose. Durations in seconds, sizes in bytes, images in pixels."""
 
@@ -79,6 +84,14 @@ class Settings(BaseSettings):
     receive_deadline_s: Annotated[
         float, Field(gt=0, le=600, description="Longest time for a request's headers, and for its body")
     ] = 30.0
+
+    otlp_endpoint: Annotated[
+        str,
+        Field(
+            pattern=r"^(https?://\S+)?$",
+            description="OpenTelemetry collector for traces, http://HOST:4318; empty: none",
+        ),
+    ] = Field(default_factory=default_otlp_endpoint)
 
     log_level: Annotated[Literal["debug", "info", "warning", "error"], Field(description="Least level logged")] = "info"
     log_format: Annotated[

@@ -19,6 +19,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from service.api.metrics import Metrics
 from service.api.problems import PROBLEM_KEY, problem_response
 from service.errors import CamindError, ReceiveTimeout, TooLarge
+from service.tracing import STAGES_KEY, Trace, Tracing
 
 REQUEST_ID = "X-Request-Id"
 SANE_REQUEST_ID = re.compile(r"[A-Za-z0-9._:-]{1,128}")
@@ -43,11 +44,12 @@ class _Exchange:
 
 
 class ObserveRequests:
-    """Gives every request an id, answers what nothing else caught, counts and logs once."""
+    """Gives every request an id, answers what nothing else caught, counts, logs and traces once."""
 
-    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+    def __init__(self, app: ASGIApp, metrics: Metrics, tracing: Tracing | None) -> None:
         self._app = app
         self._metrics = metrics
+        self._tracing = tracing
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -94,6 +96,10 @@ class ObserveRequests:
             duration_ms=round(duration_s * 1e3, 1),
             **_camera(scope, path),
         )
+        if self._tracing is not None:
+            problem, stages_ms = scope.get(PROBLEM_KEY), scope.get(STAGES_KEY, {})
+            trace = Trace(exchange.request_id, scope["method"], path, status, duration_s, problem, stages_ms)
+            self._tracing.record(trace, Headers(scope=scope))
 
 
 class AnswerHead:

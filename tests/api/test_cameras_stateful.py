@@ -154,8 +154,12 @@ def clients(app: FastAPI) -> Iterator[list[TestClient]]:
 
 
 def test_any_sequence_leaves_what_a_dictionary_holds(clients: list[TestClient], is_soak: bool) -> None:
+    class Machine(CameraMachine):
+        def __init__(self) -> None:
+            super().__init__(clients)
+
     run_state_machine_as_test(
-        lambda: CameraMachine(clients),
+        Machine,
         settings=settings(
             max_examples=300 if is_soak else 10, stateful_step_count=60 if is_soak else 20, deadline=None
         ),
