@@ -3,6 +3,7 @@
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib import import_module
 from importlib.metadata import version
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
 # where a scope holds the milliseconds of a depth request's stages
 STAGES_KEY = "camind.stages_ms"
 NAME = "camind"
+EXPORTER = "opentelemetry.exporter.otlp.proto.http.trace_exporter"
 EXPORT_TIMEOUT_S = 5
 
 
@@ -38,25 +40,28 @@ class Tracing:
 
     def __init__(self, endpoint: str) -> None:
         try:
-            from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
+            import_module(EXPORTER)
         except ImportError as exc:
             raise SettingsError(
                 f"Traces are to go to {endpoint}, and what sends them is not installed: pip install 'camind[otel]', "
                 "or unset CAMIND_OTLP_ENDPOINT and OTEL_EXPORTER_OTLP_ENDPOINT."
             ) from exc
-        self._make_exporter = lambda: OTLPSpanExporter(f"{endpoint.rstrip('/')}/v1/traces", timeout=EXPORT_TIMEOUT_S)
+        self._url = f"{endpoint.rstrip('/')}/v1/traces"
         self._provider: TracerProvider | None = None
 
     def start(self) -> None:
         """Begin to send."""
+        from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
         from opentelemetry.sdk.resources import OTELResourceDetector, Resource
         from opentelemetry.sdk.trace import TracerProvider
         from opentelemetry.sdk.trace.export import BatchSpanProcessor
 
         ours = Resource({"service.name": NAME, "service.version": version(NAME)})
         # the standard OTEL_SERVICE_NAME and OTEL_RESOURCE_ATTRIBUTES win
-        self._provider = TracerProvider(resource=ours.merge(OTELResourceDetector().detect()), shutdown_on_exit=False)
-        self._provider.add_span_processor(BatchSpanProcessor(self._make_exporter()))
+        theirs = OTELResourceDetector().detect()
+        self._provider = TracerProvider(resource=ours.merge(theirs), shutdown_on_exit=False)
+        exporter = OTLPSpanExporter(self._url, timeout=EXPORT_TIMEOUT_S)
+        self._provider.add_span_processor(BatchSpanProcessor(exporter))
 
     def close(self) -> None:
         """Send what is left, and stop."""

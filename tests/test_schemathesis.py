@@ -55,7 +55,7 @@ def _store_calibration(data_dir: Path) -> None:
     engine.dispose()
 
 
-@pytest.mark.timeout(1800)
+@pytest.mark.timeout(3600)
 def test_the_service_keeps_to_its_description(server: Server, is_soak: bool, tmp_path: Path) -> None:
     found = tmp_path / "found.json"
     command: list[str | Path] = [SCHEMATHESIS, "--config-file", CONFIG, "run", "--no-color"]
