@@ -1,12 +1,14 @@
 # The service: no torch, no onnx, no compiler, no root, nothing written but /data.
 FROM python:3.11-slim-bookworm AS build
 COPY pyproject.toml README.md LICENSE /src/
+COPY requirements /src/requirements
 COPY service /src/service
 COPY model_export /src/model_export
 COPY migrations /src/migrations
 WORKDIR /src
 RUN python3 -m venv /opt/camind
-RUN /opt/camind/bin/python -m pip install --no-cache-dir ".[postgres]"
+RUN /opt/camind/bin/python -m pip install --no-cache-dir --require-hashes -r requirements/service.txt
+RUN /opt/camind/bin/python -m pip install --no-cache-dir --no-deps --build-constraint requirements/build.txt .
 
 FROM python:3.11-slim-bookworm
 RUN useradd --system --uid 10001 --home-dir /data --create-home camind

@@ -23,6 +23,7 @@ from service.storage.calibrations import Calibrations
 from service.storage.engine import open_engine
 from service.storage.keys import Keys
 from service.storage.spool import Spool
+from service.tracing import Tracing
 
 DEPTH_PATH = "/depth"
 FROM_PHOTO_PATH = "/cameras/from-photo"
@@ -41,7 +42,10 @@ TAGS = [
 
 
 def create_app(settings: Settings, calibrate: Calibrate = calibrate) -> FastAPI:
-    """The app for these settings; nothing is opened or loaded before it starts."""
+    """The app for these settings; nothing is opened or loaded before it starts.
+
+    Raises ``SettingsError`` where they ask for traces and the extra ``otel`` is missing.
+    """
     app = FastAPIOffline(
         title="camind",
         version=version("camind"),
@@ -55,6 +59,7 @@ def create_app(settings: Settings, calibrate: Calibrate = calibrate) -> FastAPI:
     )
     app.state.settings = settings
     app.state.metrics = metrics.Metrics()
+    app.state.tracing = Tracing(settings.otlp_endpoint) if settings.otlp_endpoint else None
     app.state.calibrate = calibrate
     app.state.is_stopping = False
     _add_middleware(app, settings)
@@ -79,7 +84,7 @@ def _add_middleware(app: FastAPI, settings: Settings) -> None:
     )
     app.add_middleware(Authenticate, is_on=settings.wants_keys, requests_per_minute=settings.key_requests_per_minute)
     app.add_middleware(AnswerHead)
-    app.add_middleware(ObserveRequests, metrics=app.state.metrics)
+    app.add_middleware(ObserveRequests, metrics=app.state.metrics, tracing=app.state.tracing)
 
 
 @asynccontextmanager
@@ -106,22 +111,39 @@ def _start(app: FastAPI) -> None:
     app.state.model = folder
     app.state.estimator = estimator
     app.state.worker = Worker(
-        slots=settings.worker_slots, queue_size=settings.queue_size, deadline_s=settings.deadline_s
+        slots=settings.worker_slots,
+        queue_size=settings.queue_size,
+        deadline_s=settings.deadline_s,
+        tell_wait=app.state.metrics.time_wait,
     )
     app.state.spool = Spool(settings.spool_dir)
+    calibrations = Calibrations(engine)
     app.state.runner = Runner(
-        Calibrations(engine),
+        calibrations,
         app.state.spool,
         ImageLimits(settings.max_image_bytes, settings.max_image_pixels, settings.max_image_aspect),
         app.state.calibrate,
     )
     app.state.runner.start()
-    app.state.metrics.in_flight.set_function(lambda: app.state.worker.in_flight)
+    if app.state.tracing is not None:
+        app.state.tracing.start()
+    app.state.metrics.watch(
+        metrics.Parts(
+            folder.manifest.name,
+            app.state.worker,
+            calibrations,
+            app.state.spool.id,
+            settings.calibration_queue_size,
+        )
+    )
     app.state.is_warm = True
 
 
 def _stop(app: FastAPI) -> None:
     app.state.is_warm = False
+    app.state.metrics.watch(None)
     app.state.runner.close()
     app.state.worker.close()
     app.state.engine.dispose()
+    if app.state.tracing is not None:
+        app.state.tracing.close()

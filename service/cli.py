@@ -62,6 +62,7 @@ def serve(
     with _plain_failures():
         listener = server.bind(settings.host, settings.port)
         load_model_folder(settings.served_model_dir)
+        served = create_app(settings)
         if settings.is_database_embedded:
             _require_sound(settings)
             with _migrated(settings):
@@ -71,7 +72,7 @@ def serve(
     typer.echo(f"camind on http://{settings.host}:{listener.getsockname()[1]}", err=True)
     if not (settings.is_loopback or settings.wants_keys):
         typer.echo("Other machines can reach it, and it asks nobody who they are.", err=True)
-    if not server.serve(create_app(settings), settings, listener):
+    if not server.serve(served, settings, listener):
         raise _failure("camind did not start: the log above says why.")
 
 
@@ -373,7 +374,7 @@ def _plain_failures() -> Iterator[None]:
         yield
     except SQLAlchemyError as exc:
         raise _failure(f"The database cannot be used: {exc.args[0] if exc.args else exc}") from exc
-    except (CamindError, ModelFolderError, OSError) as exc:
+    except (CamindError, ModelFolderError, SettingsError, OSError) as exc:
         raise _failure(str(exc)) from exc
 
 

@@ -33,6 +33,11 @@ def default_data_dir() -> Path:
     return Path(base).expanduser() / "camind"
 
 
+def default_otlp_endpoint() -> str:
+    """Where traces go by OpenTelemetry's own variable; empty for nowhere."""
+    return os.environ.get("OTEL_EXPORTER_OTLP_ENDPOINT", "")
+
+
 class Settings(BaseSettings):
     """Everything an operator can choose. Durations in seconds, sizes in bytes, images in pixels."""
 
@@ -94,6 +99,13 @@ class Settings(BaseSettings):
     drain_s: Annotated[
         float, Field(ge=0, le=600, description="How long /health/ready says that the service stops before it does")
     ] = 1.0
+    otlp_endpoint: Annotated[
+        str,
+        Field(
+            pattern=r"^(https?://\S+)?$",
+            description="OpenTelemetry collector for traces, http://HOST:4318; empty: none",
+        ),
+    ] = Field(default_factory=default_otlp_endpoint)
 
     log_level: Annotated[Literal["debug", "info", "warning", "error"], Field(description="Least level logged")] = "info"
     log_format: Annotated[

@@ -17,8 +17,9 @@ from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.api.metrics import Metrics
-from service.api.problems import problem_response
+from service.api.problems import PROBLEM_KEY, problem_response
 from service.errors import CamindError, ReceiveTimeout, TooLarge
+from service.tracing import STAGES_KEY, Trace, Tracing
 
 REQUEST_ID = "X-Request-Id"
 SANE_REQUEST_ID = re.compile(r"[A-Za-z0-9._:-]{1,128}")
@@ -43,11 +44,12 @@ class _Exchange:
 
 
 class ObserveRequests:
-    """Gives every request an id, answers what nothing else caught, counts and logs once."""
+    """Gives every request an id, answers what nothing else caught, counts, logs and traces once."""
 
-    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+    def __init__(self, app: ASGIApp, metrics: Metrics, tracing: Tracing | None) -> None:
         self._app = app
         self._metrics = metrics
+        self._tracing = tracing
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -84,6 +86,8 @@ class ObserveRequests:
         status = exchange.status or CLIENT_GONE
         path = getattr(scope.get("route"), "path", None)
         self._metrics.count(scope["method"], path, status, duration_s)
+        if PROBLEM_KEY in scope:
+            self._metrics.count_problem(scope[PROBLEM_KEY])
         log.info(
             "request",
             method=scope["method"],
@@ -93,6 +97,10 @@ class ObserveRequests:
             **_camera(scope, path),
             **_key(scope),
         )
+        if self._tracing is not None:
+            problem, stages_ms = scope.get(PROBLEM_KEY), scope.get(STAGES_KEY, {})
+            trace = Trace(exchange.request_id, scope["method"], path, status, duration_s, problem, stages_ms)
+            self._tracing.record(trace, Headers(scope=scope))
 
 
 class AnswerHead:
@@ -204,6 +212,6 @@ def _key(scope: Scope) -> dict[str, str]:
 
 def _hand_back(inner: MutableMapping[str, object], scope: Scope) -> None:
     """Let the outer middleware see which route answered."""
-    for key in ("route", "path_params", "state"):
+    for key in ("route", "path_params", "state", PROBLEM_KEY):
         if key in inner:
             scope[key] = inner[key]

@@ -5,7 +5,7 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import cast
@@ -55,6 +55,7 @@ class DeadlineProtocol(H11Protocol):
     """
 
     deadline_s: float
+    count_problem: Callable[[str], None]
     _clock: asyncio.TimerHandle | None = None
     _is_refused = False
     _write_clock: asyncio.TimerHandle | None = None
@@ -135,6 +136,7 @@ class DeadlineProtocol(H11Protocol):
 
     def _refuse(self, error: CamindError) -> None:
         """Answer and close; what still comes is thrown away for a moment, for a reset would take the answer along."""
+        self.count_problem(error.code)
         body = problem(error).model_dump_json(exclude_none=True).encode()
         headers = [
             ("Content-Type", PROBLEM_TYPE),
@@ -202,7 +204,8 @@ def bind(host: str, port: int) -> socket.socket:
 def serve(app: FastAPI, settings: Settings, listener: socket.socket) -> bool:
     """Answer on the socket until told to stop; whether the app ever started."""
     keep_freed_memory()
-    protocol = type("Protocol", (DeadlineProtocol,), {"deadline_s": settings.receive_deadline_s + GRACE_S})
+    own = {"deadline_s": settings.receive_deadline_s + GRACE_S, "count_problem": app.state.metrics.count_problem}
+    protocol = type("Protocol", (DeadlineProtocol,), own)
     config = uvicorn.Config(
         app,
         http=protocol,

@@ -57,6 +57,7 @@ def test_an_empty_variable_counts_as_none(monkeypatch: pytest.MonkeyPatch) -> No
         ("MAX_CALIBRATION_IMAGES", "0"),
         ("MAX_CALIBRATION_BYTES", "1e12"),
         ("CALIBRATION_QUEUE_SIZE", "0"),
+        ("OTLP_ENDPOINT", "collector:4318"),
         ("LOG_LEVEL", "loud"),
         ("LOG_FORMAT", "xml"),
         ("DATABASE_URL", "mysql://localhost/camind"),

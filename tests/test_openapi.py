@@ -1,5 +1,6 @@
 """openapi.yaml is the app's, whole, and says of every route what it answers."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +79,20 @@ def test_operation_ids_are_plain_and_unique(document: dict[str, Any]) -> None:
     ids = [operation["operationId"] for _, operation in operations(document)]
     assert len(set(ids)) == len(ids)
     assert all(operation_id.isalpha() for operation_id in ids)
+
+
+def test_no_parameter_is_null(document: dict[str, Any]) -> None:
+    for name, operation in operations(document):
+        assert "'null'" not in str(operation.get("parameters")), name
+
+
+def test_no_parameter_is_an_address(document: dict[str, Any]) -> None:
+    names = {
+        parameter["name"] for _, operation in operations(document) for parameter in operation.get("parameters", ())
+    }
+    assert names
+    assert not [name for name in names if re.search("url|uri|href|host|callback|webhook|path|file", name)]
+    assert not re.search("'format': '(uri|hostname|ipv)", str(document))
 
 
 def test_the_framework_s_own_errors_are_nowhere(document: dict[str, Any]) -> None:

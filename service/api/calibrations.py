@@ -39,6 +39,7 @@ from service.errors import (
     TooLarge,
     UnsupportedKind,
 )
+from service.inference.images import MEDIA_TYPES
 from service.runner import RESULT
 from service.storage.calibrations import ID_PATTERN, CalibrationDraft, CalibrationRecord, Calibrations
 from service.storage.idempotency import once_of
@@ -96,7 +97,10 @@ FoundDep = Annotated[CalibrationRecord, Depends(_find)]
                             DEFOCUSED: {**FILES, "minItems": 1, "description": "Nearer and farther than the focus"},
                         },
                     },
-                    "encoding": {SETTINGS_FIELD: {"contentType": "application/json"}},
+                    "encoding": {
+                        SETTINGS_FIELD: {"contentType": "application/json"},
+                        **{role: {"contentType": ", ".join(MEDIA_TYPES)} for role in (FOCUSED, DEFOCUSED)},
+                    },
                 }
             },
         }

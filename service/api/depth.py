@@ -35,6 +35,7 @@ from service.inference.pair import Stopwatch
 from service.inference.part import Part
 from service.optics.camera import Camera
 from service.storage.cameras import CameraRecord
+from service.tracing import STAGES_KEY
 
 T = TypeVar("T")
 
@@ -130,6 +131,7 @@ async def estimate_depth(
     answer = outcome.value
     timings_ms = {**answer.timings_ms, "wait": outcome.wait_ms}
     request.app.state.metrics.time_stages(timings_ms)
+    request.scope[STAGES_KEY] = timings_ms
     return Response(
         answer.encoded.body,
         media_type=answer.encoded.media_type,

@@ -10,16 +10,16 @@ from service.inference.part import Part
 
 ROI = r"^\d{1,6},\d{1,6},\d{1,6},\d{1,6}$"
 MAX_POINTS = 1000
-POINT = re.compile(r"(-?\d{1,6}(?:\.\d{1,6})?),(-?\d{1,6}(?:\.\d{1,6})?)")
+POINT = r"^-?\d{1,6}(\.\d{1,6})?,-?\d{1,6}(\.\d{1,6})?$"
 
 
 def _require_point(value: str) -> str:
-    if not POINT.fullmatch(value):
+    if not re.fullmatch(POINT, value):
         raise ValueError("a point is two numbers of pixels, u,v: for instance 320,216")
     return value
 
 
-Point = Annotated[str, AfterValidator(_require_point)]
+Point = Annotated[str, AfterValidator(_require_point), Field(json_schema_extra={"pattern": POINT})]
 
 
 class DepthQuery(BaseModel):
@@ -48,7 +48,7 @@ class DepthQuery(BaseModel):
     ] = None
     focus_distance_m: Annotated[
         float | None,
-        Field(gt=0, allow_inf_nan=False, description="This shot's focus distance, if not the camera's"),
+        Field(ge=0.001, le=100_000, allow_inf_nan=False, description="This shot's focus distance, if not the camera's"),
     ] = None
 
     @property

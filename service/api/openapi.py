@@ -70,6 +70,8 @@ def _complete(operation: dict[str, Any]) -> None:
     # the framework assumes its own 422 wherever a route takes a parameter and documents none
     if "HTTPValidationError" in str(operation["responses"].get("422", "")):
         del operation["responses"]["422"]
+    for parameter in operation.get("parameters", ()):
+        parameter["schema"] = _without_null(parameter["schema"])
     if "requestBody" in operation:
         for status, answer in responses(*BODY_ERRORS).items():
             operation["responses"].setdefault(str(status), answer)
@@ -82,6 +84,14 @@ def _secure(operation: dict[str, Any], scope: str | None) -> None:
     operation["security"] = [{API_KEY: [scope] if scope else []}, {}]
     for status, answer in responses(*KEY_ERRORS, *([Forbidden] if scope else [])).items():
         operation["responses"].setdefault(str(status), answer)
+
+
+def _without_null(schema: dict[str, Any]) -> dict[str, Any]:
+    """The schema of a parameter, which is left out where a body's field would be null."""
+    kinds = [kind for kind in schema.get("anyOf", ()) if kind != {"type": "null"}]
+    if len(kinds) != 1:
+        return schema
+    return {**kinds[0], **{key: value for key, value in schema.items() if key != "anyOf"}}
 
 
 def to_yaml(document: object) -> str:

@@ -6,10 +6,13 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, Field
 from starlette.responses import Response
+from starlette.types import Receive, Scope, Send
 
 from service.errors import BadRequest, CamindError, FieldProblem
 
 PROBLEM_TYPE = "application/problem+json"
+# where a scope says which problem it was answered with
+PROBLEM_KEY = "camind.problem"
 TYPE_PREFIX = "urn:camind:problem:"
 MAX_ERRORS = 50
 
@@ -46,14 +49,26 @@ def problem(error: CamindError) -> Problem:
     )
 
 
+class _ProblemResponse(Response):
+    """A response that notes in the scope which problem it is."""
+
+    media_type = PROBLEM_TYPE
+    code: str
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        scope[PROBLEM_KEY] = self.code
+        await super().__call__(scope, receive, send)
+
+
 def problem_response(error: CamindError, headers: Mapping[str, str] | None = None) -> Response:
     """The error as a response, with the headers that belong to it."""
-    return Response(
+    response = _ProblemResponse(
         problem(error).model_dump_json(exclude_none=True),
         status_code=error.status,
-        media_type=PROBLEM_TYPE,
         headers={"Cache-Control": "no-store", **(headers or {}), **error.headers},
     )
+    response.code = error.code
+    return response
 
 
 EXAMPLES: dict[str, tuple[str, tuple[FieldProblem, ...]]] = {

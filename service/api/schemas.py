@@ -126,6 +126,13 @@ class CameraSpecs(Given):
         return lens.k_cam_px(self.focus_distance_m, self.image_width_px)
 
 
+# what to_camera asks for, said to programs
+K_CAM_OR_LENS: dict[str, JsonValue] = {
+    "oneOf": [
+        {"required": ["k_cam_px"], "properties": {"k_cam_px": {"type": "number"}, "lens": {"type": "null"}}},
+        {"required": ["lens"], "properties": {"k_cam_px": {"type": "null"}, "lens": {"type": "object"}}},
+    ]
+}
 K_CAM_EXAMPLE: dict[str, JsonValue] = {
     "name": "pixel7-wide",
     "image_width_px": 4080,
@@ -153,7 +160,7 @@ LENS_EXAMPLE: dict[str, JsonValue] = {
 class CameraCreate(CameraSpecs):
     """A camera to register."""
 
-    model_config = ConfigDict(json_schema_extra={"examples": [LENS_EXAMPLE, K_CAM_EXAMPLE]})
+    model_config = ConfigDict(json_schema_extra={**K_CAM_OR_LENS, "examples": [LENS_EXAMPLE, K_CAM_EXAMPLE]})
 
     name: Name
 
@@ -161,7 +168,7 @@ class CameraCreate(CameraSpecs):
 class CameraReplace(CameraSpecs):
     """A camera's next revision, whole; what is left out takes its default."""
 
-    model_config = ConfigDict(json_schema_extra={"examples": [LENS_EXAMPLE]})
+    model_config = ConfigDict(json_schema_extra={**K_CAM_OR_LENS, "examples": [LENS_EXAMPLE]})
 
     name: Annotated[Name | None, Field(description="May be left out; a camera cannot be renamed")] = None
 

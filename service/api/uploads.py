@@ -25,7 +25,8 @@ REQUEST_BODY = {
                 "required": [FIELD],
                 "additionalProperties": False,
                 "properties": {FIELD: BINARY},
-            }
+            },
+            "encoding": {FIELD: {"contentType": ", ".join(MEDIA_TYPES)}},
         },
     },
 }
@@ -57,8 +58,11 @@ async def receive_photograph(request: Request, max_bytes: int) -> Upload:
 
 async def _from_form(request: Request, max_bytes: int) -> Upload:
     stream = _bounded(request, max_bytes + MULTIPART_OVERHEAD_BYTES)
+    parser = MultiPartParser(request.headers, stream, max_files=1, max_fields=1)
+    # photographs for depth are never written to a disk, not even to an unnamed file
+    parser.spool_max_size = max_bytes + MULTIPART_OVERHEAD_BYTES
     try:
-        form = await MultiPartParser(request.headers, stream, max_files=1, max_fields=1).parse()
+        form = await parser.parse()
     except (MultiPartException, KeyError, ValueError) as exc:  # ValueError: of a charset that decodes nothing
         raise BadRequest(f"The form cannot be read ({exc}): send one file in the field '{FIELD}'.") from exc
     try:

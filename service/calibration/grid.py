@@ -20,6 +20,8 @@ COARSEST_PX = 640
 FINEST_PX = 2600
 LEAST_AREA_PX = 16.0
 LARGEST_PART = 0.3
+# below, a circle of the largest part has less than the least area
+LEAST_SIDE_PX = math.ceil(math.sqrt(LEAST_AREA_PX) / LARGEST_PART)
 THRESHOLD_STEP = 8.0
 LEAST_CIRCULARITY = 0.6
 LEAST_CONVEXITY = 0.85
@@ -34,6 +36,7 @@ REACH = 0.32
 LEAST_FOUND = 0.7
 BORDER_STEPS = 0.9
 LEAST_RADIUS_PX = 3.0
+NOTHING = "no grid of dark circles was found"
 Array = NDArray[np.float64]
 Cell = tuple[int, int]
 
@@ -66,14 +69,13 @@ def find_grid(grey: NDArray[np.uint8], grid: CircleGrid) -> FoundGrid:
 
     Looks at a small copy first, in which blur is small too, and at larger ones for small circles.
     """
-    nearest = GridError("no grid of dark circles was found")
+    nearest = GridError(NOTHING)
     longest = max(grey.shape)
     side = min(COARSEST_PX, longest)
     while True:
         ratio = side / longest
-        small = cv2.resize(grey, None, fx=ratio, fy=ratio, interpolation=cv2.INTER_AREA) if ratio < 1 else grey
         try:
-            found = _find(np.asarray(small, np.uint8), grid)
+            found = _find(_smaller(grey, ratio), grid)
         except GridError as error:
             nearest = error if _says_more(error, nearest) else nearest
         else:
@@ -81,6 +83,14 @@ def find_grid(grey: NDArray[np.uint8], grid: CircleGrid) -> FoundGrid:
         if side >= min(FINEST_PX, longest):
             raise nearest
         side = min(2 * side, FINEST_PX, longest)
+
+
+def _smaller(grey: NDArray[np.uint8], ratio: float) -> NDArray[np.uint8]:
+    if ratio * min(grey.shape) < LEAST_SIDE_PX:
+        raise GridError(NOTHING)
+    if ratio == 1:
+        return grey
+    return np.asarray(cv2.resize(grey, None, fx=ratio, fy=ratio, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _says_more(error: GridError, other: GridError) -> bool:
@@ -153,7 +163,7 @@ def _blobs(grey: NDArray[np.uint8]) -> _Blobs:
     settings.minDistBetweenBlobs = 4.0
     found = cv2.SimpleBlobDetector.create(settings).detect(grey)
     if len(found) < 4:
-        raise GridError("no grid of dark circles was found")
+        raise GridError(NOTHING)
     places = np.array([blob.pt for blob in found], np.float64)
     return _Blobs(places, np.array([blob.size for blob in found], np.float64), cKDTree(places))
 

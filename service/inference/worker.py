@@ -31,14 +31,20 @@ class Outcome(Generic[T]):
 
 
 class Worker:
-    """Runs functions that take a ``Cancellation`` first; made and closed with the app."""
+    """Runs functions that take a ``Cancellation`` first; made and closed with the app.
 
-    def __init__(self, *, slots: int, queue_size: int, deadline_s: float) -> None:
+    ``tell_wait`` is told the seconds each waited for its slot, from the slot's thread.
+    """
+
+    def __init__(
+        self, *, slots: int, queue_size: int, deadline_s: float, tell_wait: Callable[[float], None] | None = None
+    ) -> None:
         if slots < 1 or queue_size < 0 or not deadline_s > 0:
             raise ValueError("a worker needs at least one slot, no negative queue and a positive deadline")
         self.slots = slots
         self.queue_size = queue_size
         self.deadline_s = deadline_s
+        self._tell_wait = tell_wait or (lambda _: None)
         self._pool = ThreadPoolExecutor(max_workers=slots, thread_name_prefix="inference")
         self._lock = threading.Lock()
         self._live: set[Cancellation] = set()
@@ -48,6 +54,16 @@ class Worker:
     def in_flight(self) -> int:
         """Running and queued together."""
         return len(self._live)
+
+    @property
+    def slots_in_use(self) -> int:
+        """Running now."""
+        return min(self.in_flight, self.slots)
+
+    @property
+    def queue_depth(self) -> int:
+        """Waiting for a slot."""
+        return max(0, self.in_flight - self.slots)
 
     async def run(
         self, work: Callable[Concatenate[Cancellation, P], T], *args: P.args, **kwargs: P.kwargs
@@ -95,6 +111,7 @@ class Worker:
 
         def timed() -> Outcome[T]:
             started = time.perf_counter()
+            self._tell_wait(started - submitted)
             cancellation.check()
             value = work()
             self._remember(time.perf_counter() - started)

@@ -152,6 +152,14 @@ class Calibrations:
         with reading(self._engine) as session:
             return session.exec(query).one()
 
+    def live_counts(self, spool: str) -> dict[State, int]:
+        """How many of a spool's calibrations are queued, and how many running."""
+        states = col(CalibrationRow.state)
+        query = select(states, func.count()).where(col(CalibrationRow.spool) == spool, states.in_(LIVE))
+        with reading(self._engine) as session:
+            counts = dict(session.exec(query.group_by(states)).all())
+        return {state: counts.get(state, 0) for state in LIVE}
+
     def live(self, ids: Sequence[str]) -> set[str]:
         """Those of the ids that are queued or running."""
         query = select(CalibrationRow.id).where(col(CalibrationRow.id).in_(ids), col(CalibrationRow.state).in_(LIVE))

@@ -341,6 +341,15 @@ def test_no_room_is_503_with_retry_after(settings: Settings, app: FastAPI) -> No
     assert settings.queue_size > 0
 
 
+def test_a_form_touches_no_disk(client: TestClient, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "nowhere"))
+    body = png(np.random.default_rng(0).integers(0, 255, (640, 960, 3), np.uint8))
+    assert 1.5e6 < len(body) < 2e6
+    client.post("/cameras", json=CAMERA)
+    answer = client.post("/depth?camera=bench", files={"image": ("photo.png", body, "image/png")})
+    assert answer.status_code == 200
+
+
 def test_a_client_that_goes_away_gives_up_its_place(app: FastAPI) -> None:
     release = threading.Event()
     received: list[MutableMapping[str, Any]] = [

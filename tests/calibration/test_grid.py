@@ -113,3 +113,9 @@ def test_small_circles_are_too_small_and_nothing_is_nothing() -> None:
         find_grid(np.asarray(small, np.uint8), TALL)
     with pytest.raises(GridError, match="no grid"):
         find_grid(np.full((400, 500), 128, np.uint8), TALL)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 5000), (5000, 2), (13, 13), (70, 3300)])
+def test_a_picture_of_no_size_is_no_grid(shape: tuple[int, int]) -> None:
+    with pytest.raises(GridError, match="no grid"):
+        find_grid(np.full(shape, 200, np.uint8), TALL)

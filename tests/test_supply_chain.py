@@ -1,0 +1,157 @@
+"""What is installed is locked with hashes, the lock is what pyproject.toml asks for, and the audit tells the truth."""
+
+import json
+import re
+import subprocess
+import sys
+import threading
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import Version
+
+ROOT = Path(__file__).parents[1]
+LOCKS = ROOT / "requirements"
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+EXTRAS = PROJECT["project"]["optional-dependencies"]
+SERVED = PROJECT["project"]["dependencies"] + EXTRAS["postgres"] + EXTRAS["otel"]
+DEVELOPED = SERVED + EXTRAS["train"] + PROJECT["dependency-groups"]["dev"]
+# its builds, and so its hashes, differ by platform
+UNLOCKED = {"torch"}
+# extras that neither the image nor development installs
+OPTIONAL = {"cluster", "heic", "raw"}
+PIN = re.compile(r"([\w.-]+)==(\S+)(?: ; ([^\\]+?))? \\\n((?:    --hash=sha256:[0-9a-f]{64}(?: \\)?\n)+)")
+
+
+def text(lock: str) -> str:
+    """A lock without its comments."""
+    return re.sub(r"^#.*\n", "", (LOCKS / lock).read_text(), flags=re.MULTILINE)
+
+
+def pins(lock: str) -> dict[str, set[Version]]:
+    """Every version that a lock pins, for there may be one for each Python."""
+    found: dict[str, set[Version]] = {}
+    for name, version, _, _ in PIN.findall(text(lock)):
+        found.setdefault(canonicalize_name(name), set()).add(Version(version))
+    return found
+
+
+@pytest.mark.parametrize("lock", ["service.txt", "dev.txt", "build.txt"])
+def test_a_lock_is_pins_with_hashes_and_nothing_else(lock: str) -> None:
+    assert PIN.sub("", text(lock)) == ""
+    assert "make lock" in (LOCKS / lock).read_text()
+
+
+@pytest.mark.parametrize(
+    ("lock", "wanted"),
+    [
+        ("service.txt", SERVED),
+        ("dev.txt", DEVELOPED),
+        ("build.txt", PROJECT["build-system"]["requires"]),
+    ],
+)
+def test_a_lock_satisfies_pyproject(lock: str, wanted: list[str]) -> None:
+    locked = pins(lock)
+    for requirement in map(Requirement, wanted):
+        if requirement.name not in UNLOCKED:
+            versions = locked.get(canonicalize_name(requirement.name), set())
+            assert versions, f"{requirement} is not in {lock}: run `make lock`"
+            assert all(requirement.specifier.contains(version) for version in versions), f"{requirement}: `make lock`"
+
+
+def test_every_extra_is_locked_or_known_not_to_be() -> None:
+    assert set(EXTRAS) == {"train", "postgres", "otel"} | OPTIONAL
+
+
+def test_development_has_what_the_service_has() -> None:
+    developed = pins("dev.txt")
+    assert {name: developed[name] for name in pins("service.txt")} == pins("service.txt")
+    assert not set(pins("service.txt")) & {"torch", "onnx", "pytest"}
+
+
+def test_everything_that_installs_asks_for_hashes() -> None:
+    for place in (ROOT / "docker" / "service.Dockerfile", ROOT / "Makefile"):
+        installs = [line for line in place.read_text().splitlines() if re.search(r"pip install|PIP\) install", line)]
+        assert installs
+        for line in installs:
+            is_hashed = "--require-hashes" in line or ("--no-deps" in line and "--build-constraint" in line)
+            assert is_hashed or "torch==" in line, line
+
+
+def test_the_bill_of_materials_names_every_pin(tmp_path: Path) -> None:
+    out = tmp_path / "sbom.json"
+    command = ["make", "--dry-run", "--always-make", "sbom"]
+    planned = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    words = re.sub(r"\\\n", " ", planned).partition("cyclonedx-py ")[2].split()
+    words[words.index("dist/sbom.json")] = str(out)
+    program = Path(sys.executable).parent / "cyclonedx-py"
+    subprocess.run([program, *words], cwd=ROOT, check=True, capture_output=True)
+    components = json.loads(out.read_text())["components"]
+    assert {canonicalize_name(component["name"]) for component in components} == set(pins("service.txt"))
+
+
+def audited(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(LOCKS / "audit.py"), "-s", "osv", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@contextmanager
+def database(vulnerable: str) -> Iterator[str]:
+    """A database of vulnerabilities that knows one, of the package of this name; its URL."""
+
+    class Answers(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            asked = json.loads(self.rfile.read(int(self.headers["Content-Length"])))["package"]
+            affected = {"package": asked, "ranges": [{"type": "ECOSYSTEM", "events": [{"fixed": "99.0"}]}]}
+            known = [{"id": "CVE-2026-0001", "summary": "bad", "affected": [affected]}]
+            body = json.dumps({"vulns": known} if asked["name"] == vulnerable else {}).encode()
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Answers) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}/v1/query"
+        server.shutdown()
+        thread.join()
+
+
+def test_a_known_vulnerability_fails_the_audit() -> None:
+    with database("starlette") as url:
+        done = audited("--osv-url", url)
+    assert done.returncode == 1
+    assert "VULNERABLE: starlette" in done.stdout
+    assert "mended in 99.0" in done.stdout
+
+
+def test_a_lock_without_any_passes_and_says_how_much_was_looked_up() -> None:
+    with database("none of ours") as url:
+        done = audited("--strict", "--osv-url", url)
+    assert done.returncode == 0, done.stderr
+    looked_up, of = map(int, re.findall(r"(\d+) of (\d+) locked packages looked up: 0 ", done.stdout)[0])
+    assert looked_up == of > 100
+
+
+@pytest.mark.parametrize(("arguments", "code"), [((), 0), (("--strict",), 2)])
+def test_a_database_out_of_reach_is_said_aloud(arguments: tuple[str, ...], code: int) -> None:
+    done = audited("--osv-url", "http://127.0.0.1:1/v1/query", *arguments)
+    assert done.returncode == code
+    assert "NOT AUDITED" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_wrong_call_is_no_unreachable_database() -> None:
+    done = audited("--nonsense")
+    assert done.returncode == 2
+    assert "NOT AUDITED" not in done.stderr
