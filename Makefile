@@ -3,7 +3,7 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test check openapi
+.PHONY: help setup run test soak check openapi
 
 help: ## Say what each command means
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /|/' | awk -F'|' '{printf "make %-10s %s\n", $$1, $$2}'
@@ -28,6 +28,9 @@ run: .venv/.service ## Start the service with the shipped model on http://127.0.
 
 test: setup ## Run the tests
 	$(BIN)/pytest -n 2
+
+soak: setup ## Run the long versions of the tests that kill, fill and load the service: an hour or two
+	$(BIN)/pytest --soak -s tests/test_killed.py tests/test_soak.py tests/test_migrations.py tests/storage/test_backup.py
 
 check: setup ## Lint, check types and the arrows between packages
 	$(BIN)/ruff check .
