@@ -3,11 +3,13 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 INSTALL := $(PIP) install --require-hashes --requirement
 OURSELVES := $(PIP) install --no-deps --build-constraint requirements/build.txt --editable .
+SOAKED := tests/test_killed.py tests/test_soak.py tests/test_migrations.py tests/storage/test_backup.py \
+	tests/test_fuzzed_bytes.py tests/test_schemathesis.py
 LOCK := $(BIN)/uv pip compile --quiet --universal --generate-hashes --python-version 3.11 --no-annotate \
 	--custom-compile-command "make lock" $(LOCK_FLAGS)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test check audit lock sbom openapi
+.PHONY: help setup run test soak check audit lock sbom openapi
 
 help: ## Say what each command means
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /|/' | awk -F'|' '{printf "make %-10s %s\n", $$1, $$2}'
@@ -33,6 +35,9 @@ run: .venv/.service ## Start the service with the shipped model on http://127.0.
 
 test: setup ## Run the tests
 	$(BIN)/pytest -n 2
+
+soak: setup ## Run the long versions of the tests that kill, fill and load the service: an hour or two
+	$(BIN)/pytest --soak -s $(SOAKED)
 
 check: setup ## Lint, check types, the arrows between packages, and the dependencies for known vulnerabilities
 	$(BIN)/ruff check .

@@ -105,8 +105,8 @@ def test_a_stop_waits_for_no_calibration_and_no_listener(data_dir: Path, server:
     started_s = time.monotonic()
     assert server.stop(signal.SIGTERM) == 0
     assert time.monotonic() - started_s < 10
-    with closing(sqlite3.connect(data_dir / "camind.sqlite3")) as connection:
-        assert connection.execute("SELECT state, attempts FROM calibrations").fetchall() == [("queued", 0)] * 2
+    with closing(sqlite3.connect(data_dir / "camind.sqlite3")) as database:
+        assert database.execute("SELECT state, attempts FROM calibrations").fetchall() == [("queued", 0)] * 2
     assert waiting.getresponse().status == 202
     assert len(folders(data_dir)) == 2
     for connection in (listener, waiting):

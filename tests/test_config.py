@@ -54,6 +54,7 @@ def test_an_empty_variable_counts_as_none(monkeypatch: pytest.MonkeyPatch) -> No
         ("MAX_IMAGE_ASPECT", "0.5"),
         ("RECEIVE_DEADLINE_S", "inf"),
         ("CALIBRATION_RECEIVE_DEADLINE_S", "inf"),
+        ("DRAIN_S", "-1"),
         ("MAX_CALIBRATION_IMAGES", "0"),
         ("MAX_CALIBRATION_BYTES", "1e12"),
         ("CALIBRATION_QUEUE_SIZE", "0"),

@@ -1,10 +1,17 @@
 """Migrations run from nothing to the tables and back, on both databases, and are named by date."""
 
 import re
+import shutil
+import sqlite3
+import subprocess
+import sys
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 
+import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 from sqlalchemy import Engine, inspect, text
@@ -13,9 +20,43 @@ import migrations
 from service.optics.camera import Camera
 from service.storage import schema
 from service.storage.cameras import CameraDraft, Cameras
+from service.storage.engine import open_engine
 from service.storage.tables import metadata
 
 VERSIONS = Path(migrations.__file__).parent / "versions"
+FIRST = "2026_11_21_cameras"
+NAMES = [f"camera-{number}" for number in range(5)]
+ROUNDS, SOAK_ROUNDS = 12, 300
+
+# `camind migrate` in forks of one process that has everything loaded, so that a kill is hardly ever before it begins;
+# each on a copy of a folder, and killed after a random part of the time that the first one took
+KILLED_MIGRATIONS = """
+import os, random, shutil, signal, sys, time
+from pathlib import Path
+import sqlalchemy.dialects.sqlite, service.storage.backup, service.storage.schema, service.inference.artifact
+from service import cli
+
+folder, rounds, seed = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
+os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+random.seed(seed)
+
+def migrate(number):
+    data = shutil.copytree(folder, folder.with_name(f"killed-{number:05d}"))
+    child = os.fork()
+    if child == 0:
+        os.environ["CAMIND_DATA_DIR"] = str(data)
+        cli.app(["migrate"])
+    return child
+
+started_s = time.monotonic()
+assert os.waitpid(migrate(0), 0)[1] == 0
+duration_s = time.monotonic() - started_s
+for number in range(1, rounds + 1):
+    child = migrate(number)
+    time.sleep(random.random() * duration_s)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+"""
 
 
 def test_an_empty_database_gets_every_table(empty_engine: Engine) -> None:
@@ -95,3 +136,50 @@ def test_migrations_are_named_by_date() -> None:
     for name in names:
         assert re.fullmatch(r"20\d\d_[01]\d_[0-3]\d_[a-z0-9_]+", name)
         assert f'revision = "{name}"' in (VERSIONS / f"{name}.py").read_text()
+
+
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("begin", [None, FIRST])
+def test_a_killed_migration_leaves_the_old_schema_or_the_new(tmp_path: Path, begin: str | None, is_soak: bool) -> None:
+    data = tmp_path / "data"
+    data.mkdir()
+    if begin:
+        _make_first_schema(data / "camind.sqlite3")
+    rounds = SOAK_ROUNDS if is_soak else ROUNDS
+    subprocess.run([sys.executable, "-c", KILLED_MIGRATIONS, data, str(rounds), "1"], check=True)
+    found = Counter(_checked(folder / "camind.sqlite3") for folder in tmp_path.glob("killed-*"))
+    # the first was not killed
+    assert found.total() == rounds + 1
+    assert set(found) <= {begin, schema.head_revision()}
+    assert found[begin] > 0 or not is_soak
+    print(f"killed migrations from {begin}: {dict(found)}")  # noqa: T201  (figures, for who asks with -s)
+    for folder in tmp_path.glob("killed-*"):
+        engine = open_engine(f"sqlite:///{folder / 'camind.sqlite3'}")
+        schema.upgrade(engine)
+        names = [record.name for record in Cameras(engine).page(10)[0]]
+        engine.dispose()
+        assert names == (NAMES if begin else [])
+        assert _checked(folder / "camind.sqlite3") == schema.head_revision()
+        shutil.rmtree(folder)
+
+
+def _make_first_schema(database: Path) -> None:
+    engine = open_engine(f"sqlite:///{database}")
+    schema.upgrade(engine, FIRST)
+    for name in NAMES:
+        Cameras(engine).add(CameraDraft(name, Camera(4, 3, 1.0, 2.0, 0.5), "given"))
+    engine.dispose()
+
+
+def _checked(database: Path) -> str | None:
+    """The schema of a database, all of which can be read and fits together."""
+    with closing(sqlite3.connect(database)) as connection:
+        assert connection.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+        tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        if "alembic_version" not in tables:
+            assert tables == set()
+            return None
+        revisions: list[str] = [row[0] for row in connection.execute("SELECT version_num FROM alembic_version")]
+    assert len(revisions) == 1
+    assert ("calibrations" in tables) == (revisions != [FIRST])
+    return revisions[0]

@@ -73,7 +73,7 @@ def post_calibration(client: TestClient, *, register: bool = False) -> Any:
 
 def fill(client: TestClient) -> list[str]:
     """Register cameras until there is no room for one more; their names."""
-    stored = []
+    stored: list[str] = []
     for number in range(MOST_CAMERAS):
         answer = client.post("/cameras", json=camera(f"camera-{number:02d}"))
         if answer.status_code != 201:

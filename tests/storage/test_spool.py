@@ -1,11 +1,14 @@
 """The spool keeps photographs under names of its own, and is worked off by one process at a time."""
 
+import os
+import time
 from pathlib import Path
 from uuid import uuid4
 
 import pytest
 
-from service.storage.spool import Spool, picture_file
+from service.errors import NotReady
+from service.storage.spool import LEFT_BEHIND_AFTER_S, Spool, picture_file
 
 
 @pytest.fixture
@@ -54,8 +57,29 @@ def test_one_at_a_time_works_it_off(spool: Spool, tmp_path: Path) -> None:
     other.release()
 
 
-def test_what_is_being_received_is_nobody_s_orphan(spool: Spool) -> None:
+def test_what_is_being_received_is_nobody_s_orphan(spool: Spool, tmp_path: Path) -> None:
     """A start's cleaning once took a folder whose row was about to be stored."""
+    other = Spool(tmp_path / "data" / "calibrations")
     with spool.receiving("a" * 32):
-        assert spool.ids() == []
-    assert spool.ids() == ["a" * 32]
+        assert spool.ids() == other.ids() == []
+        assert (spool.incoming, other.incoming) == (1, 0)
+    assert spool.ids() == other.ids() == ["a" * 32]
+
+
+def test_folders_that_never_got_their_name_are_removed(spool: Spool, tmp_path: Path) -> None:
+    old, new = (tmp_path / "data" / "calibrations" / f".{uuid4().hex}" for _ in range(2))
+    for draft in (old, new):
+        draft.mkdir()
+        (draft / "lock").touch()
+    long_ago_s = time.time() - LEFT_BEHIND_AFTER_S - 1
+    os.utime(old, (long_ago_s, long_ago_s))
+    assert spool.acquire()
+    assert (old.exists(), new.exists()) == (False, True)
+    spool.release()
+
+
+def test_a_spool_that_is_gone_takes_nothing(spool: Spool, tmp_path: Path) -> None:
+    (tmp_path / "data").rename(tmp_path / "elsewhere")
+    with pytest.raises(NotReady), spool.receiving(uuid4().hex):
+        pass
+    assert spool.incoming == 0
