@@ -3,8 +3,7 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 INSTALL := $(PIP) install --require-hashes --requirement
 OURSELVES := $(PIP) install --no-deps --build-constraint requirements/build.txt --editable .
-SOAKED := tests/test_killed.py tests/test_soak.py tests/test_migrations.py tests/storage/test_backup.py \
-	tests/test_fuzzed_bytes.py tests/test_schemathesis.py
+SOAKED := $(shell grep -rl is_soak tests --include='test_*.py')
 LOCK := $(BIN)/uv pip compile --quiet --universal --generate-hashes --python-version 3.11 --no-annotate \
 	--custom-compile-command "make lock" $(LOCK_FLAGS)
 

@@ -8,10 +8,13 @@ from typing import Any, ClassVar
 import httpx2
 import pytest
 from fastapi import FastAPI
-from hypothesis import settings
+from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
 from starlette.testclient import TestClient
+
+from service.config import Settings
+from service.storage.keys import Keys
 
 LENS = {"focal_length_mm": 35, "f_number": 2.8, "pixel_pitch_um": 6.05, "sensor_width_px": 3872}
 INTRINSICS = {"fx_px": 900.0, "fy_px": 901.0, "cx_px": 31.5, "cy_px": 23.5, "distortion": [0.1, -0.2, 0.0, 0.0]}
@@ -147,10 +150,17 @@ def require_all(found: list[dict[str, Any]], shelf: Shelf) -> None:
 
 
 @pytest.fixture
+def settings(settings: Settings) -> Settings:
+    return settings.model_copy(update={"api_keys": "on", "key_requests_per_minute": 0})
+
+
+@pytest.fixture
 def clients(app: FastAPI) -> Iterator[list[TestClient]]:
-    """A client for every owner."""
-    with TestClient(app) as client:
-        yield [client]
+    """A client for each of two owners, who use the same names."""
+    with TestClient(app):
+        keys: Keys = app.state.keys
+        texts = [keys.create(owner, owner)[1] for owner in ("lab", "shop")]
+        yield [TestClient(app, headers={"Authorization": f"Bearer {text}"}) for text in texts]
 
 
 def test_any_sequence_leaves_what_a_dictionary_holds(clients: list[TestClient], is_soak: bool) -> None:
@@ -160,7 +170,7 @@ def test_any_sequence_leaves_what_a_dictionary_holds(clients: list[TestClient], 
 
     run_state_machine_as_test(
         Machine,
-        settings=settings(
+        settings=hypothesis_settings(
             max_examples=300 if is_soak else 10, stateful_step_count=60 if is_soak else 20, deadline=None
         ),
     )
