@@ -2,10 +2,12 @@
 
 import struct
 from collections.abc import Iterator
+from itertools import islice
 
 from service.errors import InvalidImage
 
 MOST_BOXES = 20_000
+MOST_LISTS = 8
 # where the corners of the stored picture, numbered row by row, stand upright, by EXIF orientation
 ORIENTATIONS = {
     (0, 1, 2, 3): 1,
@@ -65,7 +67,7 @@ def _moved(corners: Corners, order: Corners) -> Corners:
 def _properties(data: bytes, start: int, end: int, item: int) -> Iterator[tuple[bytes, int]]:
     """An item's properties in the order they apply, each with where its content begins."""
     held: list[tuple[bytes, int]] = []
-    for name, at, stop in _boxes(data, start, end):
+    for name, at, stop in islice(_boxes(data, start, end), MOST_LISTS):
         if name == b"ipco":
             held = [(each, begins) for each, begins, _ in _boxes(data, at, stop)]
         elif name == b"ipma":

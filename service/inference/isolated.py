@@ -17,7 +17,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import InvalidImage, TooLarge, UnsupportedKind
+from service.errors import Busy, InvalidImage, TooLarge, UnsupportedKind
 from service.inference.isolated_decoder import DECODED, HEAD, TOO_LARGE
 
 PROGRAM = Path(__file__).with_name("isolated_decoder.py")
@@ -33,16 +33,14 @@ ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 def decode_isolated(kind: str, data: bytes, max_pixels: int) -> NDArray[np.uint8]:
     """The pixels [h, w, 3] RGB of a HEIC, upright, or of a raw file, as stored.
 
-    Raises ``UnsupportedKind`` without the extra, ``TooLarge`` and ``InvalidImage``.
+    Raises ``UnsupportedKind`` without the extra, ``TooLarge``, ``InvalidImage`` and ``Busy``.
     """
     module, extra = MODULES[kind]
     if importlib.util.find_spec(module) is None:
         raise UnsupportedKind(f"A {kind} file needs the service's extra '{extra}', which is not installed: send JPEG.")
     memory_bytes = MEMORY_BYTES + MEMORY_BYTES_PER_PIXEL * max_pixels
     command: list[str | Path] = [sys.executable, "-I", PROGRAM, kind, str(max_pixels), str(memory_bytes), str(CPU_S)]
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=ENVIRONMENT, cwd="/"
-    ) as process:
+    with _started(command) as process:
         clock = threading.Timer(WALL_S, process.kill)
         clock.start()
         try:
@@ -51,6 +49,15 @@ def decode_isolated(kind: str, data: bytes, max_pixels: int) -> NDArray[np.uint8
         finally:
             clock.cancel()
             process.kill()
+
+
+def _started(command: list[str | Path]) -> "subprocess.Popen[bytes]":
+    try:
+        return subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=ENVIRONMENT, cwd="/"
+        )
+    except OSError as exc:
+        raise Busy("There is no room for another process: try again later.") from exc
 
 
 def _hand_over(data: bytes, stream: BufferedWriter) -> None:

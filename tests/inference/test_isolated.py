@@ -1,6 +1,7 @@
 """HEIC and raw files: turned and limited as any other, and their decoders can hang, swell or die without harm."""
 
 import json
+import struct
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -9,11 +10,11 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from service.errors import InvalidImage, TooLarge, UnsupportedKind
+from service.errors import Busy, InvalidImage, TooLarge, UnsupportedKind
 from service.inference import isolated
 from service.inference.headers import read_header
 from service.inference.images import TURNS, ImageLimits, read_photograph, read_stored_frame, turned
-from tests.inference.heics import heic
+from tests.inference.heics import box, heic, whole
 from tests.inference.photographs import corners, png, tiff
 from tests.inference.raws import dng, with_preview
 
@@ -104,6 +105,17 @@ def test_a_heic_is_measured_before_a_decoder_starts(
         read_photograph(heic(stated=stated, crop=None))
 
 
+def test_boxes_without_end_are_limited_and_cheap() -> None:
+    data = heic(3)
+    # each list claims more items than there are bytes
+    properties = box(b"iprp", whole(b"ipma", b"\xff" * 4, bytes(8)) * 20_000)
+    meta = whole(b"meta", whole(b"pitm", struct.pack(">H", 1)), properties)
+    with pytest.raises(InvalidImage):
+        read_header(data[: data.index(b"meta") - 4] + meta + box(b"mdat", bytes(1_000_000)))
+    with pytest.raises(InvalidImage, match="boxes"):
+        read_header(data + box(b"free") * 20_000)
+
+
 @pytest.mark.parametrize("orientation", [1, 6])
 def test_a_raw_file_is_developed_and_turned_once(orientation: int) -> None:
     photograph = read_photograph(dng(orientation), "image/x-adobe-dng")
@@ -153,6 +165,12 @@ def test_a_decoder_that_misbehaves_is_a_damaged_file(
     monkeypatch.setattr(isolated, "WALL_S", 1.0 if "sleep" in misdeed else 60.0)
     misbehave(misdeed)
     with pytest.raises(InvalidImage, match="heic"):
+        read_photograph(heic())
+
+
+def test_no_room_for_a_process_is_busy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", "/nowhere")
+    with pytest.raises(Busy):
         read_photograph(heic())
 
 
