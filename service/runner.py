@@ -128,6 +128,7 @@ class Runner:
 
     def _sweep(self) -> None:
         """Remove the photographs of what has ended, and of what was never received whole."""
+        self._spool.remove_drafts()
         ids = self._spool.ids()
         for calibration_id in set(ids) - self._calibrations.live(ids):
             self._spool.remove(calibration_id)

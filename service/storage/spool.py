@@ -18,8 +18,8 @@ from service.storage.disk import storing, sync_folder, try_lock, write_through
 
 ID_FILE = "spool-id"
 LOCK_FILE = "lock"
-# far longer than it takes to name a folder that was made
-LEFT_BEHIND_AFTER_S = 60.0
+# far longer than it takes to name a folder that was made; who takes longer is told to come again
+LEFT_BEHIND_AFTER_S = 10.0
 
 
 class Spool:
@@ -82,27 +82,24 @@ class Spool:
             if re.fullmatch(ID_PATTERN, path.name) and not _is_being_filled(path)
         ]
 
+    def remove_drafts(self) -> None:
+        """Remove folders whose process ended between making and naming them."""
+        for draft in self._folder.glob(".*/"):
+            with suppress(FileNotFoundError):
+                if time.time() - draft.stat().st_mtime > LEFT_BEHIND_AFTER_S:
+                    self.remove(draft.name)
+
     def acquire(self) -> bool:
         """Become the one process that works this spool off; False while another is. Ends with the process."""
         if self._lock is None:
             self._lock = try_lock(self._folder / LOCK_FILE)
-            if self._lock is None:
-                return False
-            self._remove_drafts()
-        return True
+        return self._lock is not None
 
     def release(self) -> None:
         """Let another process work the spool off."""
         if self._lock is not None:
             self._lock.close()
             self._lock = None
-
-    def _remove_drafts(self) -> None:
-        """Remove folders whose process ended between making and naming them."""
-        for draft in self._folder.glob(".*/"):
-            with suppress(FileNotFoundError):
-                if time.time() - draft.stat().st_mtime > LEFT_BEHIND_AFTER_S:
-                    self.remove(draft.name)
 
 
 def picture_file(number: int) -> str:
