@@ -35,7 +35,8 @@ def main() -> int:
         mended = ", ".join(item["fix_versions"]) or "no version"
         print(f"VULNERABLE: {package['name']} {package['version']}: {item['id']}, mended in {mended}")
     skipped = [package["name"] for package in packages if "skip_reason" in package]
-    print(f"{len(packages) - len(skipped)} of {len(packages)} locked packages looked up: {len(known)} vulnerabilities.")
+    if len(skipped) < len(packages):
+        print(f"{len(packages) - len(skipped)} of {len(packages)} packages looked up: {len(known)} vulnerabilities.")
     if known:
         return 1
     if skipped:
