@@ -29,7 +29,7 @@ run: .venv/.service ## Start the service with the shipped model on http://127.0.
 test: setup ## Run the tests
 	$(BIN)/pytest -n 2
 
-soak: setup ## Run the long versions of the tests that kill, fill and load the service: an hour or two
+soak: setup ## Run the long versions of the tests that kill and load the service: a quarter of an hour
 	$(BIN)/pytest --soak -s tests/test_killed.py tests/test_soak.py tests/test_migrations.py tests/storage/test_backup.py
 
 check: setup ## Lint, check types and the arrows between packages
