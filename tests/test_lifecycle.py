@@ -113,7 +113,8 @@ def test_a_running_service_is_backed_up_and_not_restored(server: Server, tmp_pat
     assert server.add(CAMERA) == 201
     done = camind("backup", copy)
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.startswith(f"{copy} holds calibrations 0, camera_revisions 1, cameras 1; schema 20")
+    assert done.stdout.startswith(f"{copy} holds ")
+    assert "camera_revisions 1, cameras 1, " in done.stdout
     assert camind("backup", copy).returncode == 1
     assert server.add({**CAMERA, "name": "later"}) == 201
     refused = camind("restore", copy)

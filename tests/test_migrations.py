@@ -166,8 +166,17 @@ def test_a_killed_migration_leaves_the_old_schema_or_the_new(tmp_path: Path, beg
 def _make_first_schema(database: Path) -> None:
     engine = open_engine(f"sqlite:///{database}")
     schema.upgrade(engine, FIRST)
-    for name in NAMES:
-        Cameras(engine).add(CameraDraft(name, Camera(4, 3, 1.0, 2.0, 0.5), "given"))
+    # as the tables were then: what the code writes today has other columns
+    camera = "INSERT INTO cameras (name, revision, created_at, updated_at) VALUES (:name, 1, :now, :now)"
+    revision = (
+        "INSERT INTO camera_revisions (camera_id, revision, created_at, source, image_width_px, image_height_px, "
+        "focus_distance_m, k_cam_px, gamma_px, k_r) SELECT id, 1, :now, 'given', 4, 3, 1, 2, 0.5, 4 FROM cameras "
+        "WHERE name = :name"
+    )
+    with engine.begin() as connection:
+        for name in NAMES:
+            for statement in (camera, revision):
+                connection.execute(text(statement), {"name": name, "now": datetime.now(UTC)})
     engine.dispose()
 
 

@@ -14,7 +14,7 @@ from model_export.served import serving
 from service import errors
 from service.inference.cancellation import Cancellation
 from service.storage import schema
-from service.storage.calibrations import CalibrationDraft
+from service.storage.calibrations import CalibrationDraft, Calibrations
 from tests.fake_calibration import SETTINGS
 from tests.inference.photographs import corners, png
 
@@ -81,12 +81,12 @@ def test_a_wait_is_told_of_refused_photographs_too(client: TestClient, phone: di
 
 
 def test_calibrations_are_counted_by_state(client: TestClient, app: FastAPI) -> None:
-    spool = app.state.spool.id
+    spool, calibrations = app.state.spool.id, Calibrations(app.state.engine)
     app.state.runner.close()
     for number in range(3):
-        app.state.calibrations.add(CalibrationDraft(f"{number:032x}", spool, "bench", SETTINGS, ()))
-    app.state.calibrations.add(CalibrationDraft(f"{9:032x}", "another process", "bench", SETTINGS, ()))
-    app.state.calibrations.take(spool)
+        calibrations.add(CalibrationDraft(f"{number:032x}", spool, "bench", SETTINGS, ()))
+    calibrations.add(CalibrationDraft(f"{9:032x}", "another process", "bench", SETTINGS, ()))
+    calibrations.take(spool)
     assert figure(client, "camind_calibrations", state="queued") == 2
     assert figure(client, "camind_calibrations", state="running") == 1
     assert figure(client, "camind_calibration_queue_size") == 8

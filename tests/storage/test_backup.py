@@ -291,7 +291,7 @@ def test_only_a_file_is_a_database_file(tmp_path: Path) -> None:
 
 
 def test_a_kill_at_any_moment_of_a_restore_leaves_the_old_or_the_new(database: Path, copy: Path, is_soak: bool) -> None:
-    step = "1" if is_soak else "19"
+    step = "1" if is_soak else "11"
     subprocess.run([sys.executable, "-c", KILLED_RESTORES, copy, database.parent, step], check=True)
     found = []
     for data in sorted(database.parent.parent.glob("killed-*")):
