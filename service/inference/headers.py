@@ -34,6 +34,8 @@ MOST_DIRECTORIES = 16
 TIFF_TYPES = {1: "B", 3: "H", 4: "I", 13: "I"}
 TIFF_MAX_VALUES = 100_000
 TIFF_MAX_ENTRIES = 4_096
+TIFF_TILE_SIZE = (322, 323)
+TIFF_SMALL_TILE_PIXELS = 2**20
 # of one file: a part costs its reader time, and a scan of a jpeg costs its decoder a pass over the whole picture
 MOST_PARTS = 20_000
 MOST_SCANS = 64
@@ -201,8 +203,17 @@ def _tiff(data: bytes) -> Header:
         raise UnsupportedKind("A tiff of floating-point numbers is no photograph: send 8 or 16 bits, sRGB.")
     if not set(directory.values(TIFF_BITS)) <= {8, 16}:
         raise UnsupportedKind("A tiff must have 8 or 16 bits a channel.")
+    _require_tiles(directory)
     at = directory.offset_of(TIFF_ORIENTATION)
     return Header("tiff", *directory.size, directory.orientation(), at)
+
+
+def _require_tiles(directory: "_TiffDirectory") -> None:
+    """Tiles far larger than the picture, which a decoder makes room for, mean harm."""
+    width, height = directory.size
+    across, down = (next(iter(directory.values(tag)), 0) for tag in TIFF_TILE_SIZE)
+    if across * down > max(TIFF_SMALL_TILE_PIXELS, 2 * width * height):
+        raise InvalidImage(f"The tiff file states tiles of {across}x{down} pixels for {width}x{height} pixels.")
 
 
 def _sensor_size(data: bytes, first: "_TiffDirectory") -> tuple[int, int] | None:

@@ -1,10 +1,13 @@
 """The door for photographs: what is let in comes out upright and whole, what is not is refused early."""
 
 import resource
+import struct
 from collections.abc import Callable
+from io import BytesIO
 
 import numpy as np
 import pytest
+import tifffile
 
 from service.errors import InvalidImage, TooLarge, UnsupportedKind
 from service.inference.headers import MOST_PARTS, MOST_SCANS, read_header
@@ -190,6 +193,17 @@ def test_parts_without_end_are_limited_and_cheap() -> None:
         with pytest.raises(InvalidImage, match=f"{kind} file has more than {MOST_PARTS} parts"):
             read_photograph(data)
     assert read_photograph(jpeg(corners()).replace(b"\xff\xda", b"\xff" * 1_000_000 + b"\xda", 1)).width_px == 64
+
+
+def test_a_tile_far_larger_than_its_picture_is_refused() -> None:
+    out = BytesIO()
+    tifffile.imwrite(out, corners(), photometric="rgb", tile=(16, 16), compression="zlib", metadata=None)
+    data = out.getvalue()
+    assert read_photograph(data).width_px == 64
+    entry, larger = (struct.pack("<HHII", 323, 4, 1, rows) for rows in (16, 8_000_000))
+    assert entry in data
+    with pytest.raises(InvalidImage, match="16x8000000"):
+        read_photograph(data.replace(entry, larger))
 
 
 def test_a_small_file_of_a_huge_picture_costs_no_memory() -> None:
