@@ -86,7 +86,7 @@ def test_everything_that_installs_asks_for_hashes() -> None:
 
 def test_the_bill_of_materials_names_every_pin(tmp_path: Path) -> None:
     out = tmp_path / "sbom.json"
-    command = ["make", "--dry-run", "--always-make", "sbom"]
+    command = ["make", "--no-print-directory", "--dry-run", "--always-make", "sbom"]
     planned = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     words = re.sub(r"\\\n", " ", planned).partition("cyclonedx-py ")[2].split()
     words[words.index("dist/sbom.json")] = str(out)

@@ -130,10 +130,11 @@ class Cameras:
     def _add(self, draft: CameraDraft, once: Once | None) -> CameraRecord:
         now = datetime.now(UTC)
         with writing(self._engine) as session:
+            # the camera first: one that another process stored just now has its outcome beside it
+            row = _find_row(session, self._owner, draft.name, lock=True)
             stored = outcome_of(session, self._owner, once) if once else None
             if stored is not None:
                 return _as_added(session, self._owner, draft.name, int(stored))
-            row = _find_row(session, self._owner, draft.name, lock=True)
             if row is not None and row.deleted_at is None:
                 raise _taken(draft.name)
             row = row or CameraRow(owner=self._owner, name=draft.name, revision=0, created_at=now, updated_at=now)
