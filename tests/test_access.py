@@ -284,6 +284,8 @@ def test_the_log_names_the_key_but_not_its_secret(tmp_path: Path, tiny_model_dir
     with serving(data_dir, "--model", tiny_model_dir, settings=on) as server:
         assert server.ask("GET", "/cameras", headers={"Authorization": f"Bearer {text}"}).status == 200
         assert server.ask("GET", "/cameras", headers={"Authorization": f"Bearer {text}x"}).status == 401
+        # the log has a request once its answer is out
+        server.poll(lambda: '"status": 401' in server.log)
         seen = [json.loads(line) for line in server.log.splitlines() if line.startswith("{")]
         asked = [line for line in seen if line.get("path") == "/cameras" or line.get("status") == 401]
         assert [(line["status"], line.get("key")) for line in asked] == [(200, text.split("_")[1]), (401, None)]
