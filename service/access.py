@@ -64,7 +64,7 @@ class Authenticate:
         needed = needed_scope(scope["method"], scope["path"])
         if needed is not None and needed not in key.scopes:
             raise Forbidden(f"This API key lacks the scope {needed}.", scope=needed)
-        return Principal(key.owner, key.scopes, key.id)
+        return Principal(key.owner, key.id)
 
     def _count(self, key: ApiKey) -> None:
         if self._quota is None or self._limiter.hit(self._quota, key.id):

@@ -66,6 +66,7 @@ def create_app(settings: Settings, calibrate: Calibrate = calibrate) -> FastAPI:
     handlers.install(app)
     for part in (cameras, depth, calibrations, target, model, health, metrics, pages):
         app.include_router(part.router)
+    # FastAPI's own way to another description: https://fastapi.tiangolo.com/how-to/extending-openapi/
     app.openapi = lambda: openapi.describe(app)  # type: ignore[method-assign]
     return app
 
@@ -121,7 +122,7 @@ def _start(app: FastAPI) -> None:
     app.state.runner = Runner(
         calibrations,
         app.state.spool,
-        ImageLimits(settings.max_image_bytes, settings.max_image_pixels, settings.max_image_aspect),
+        ImageLimits.of(settings),
         app.state.calibrate,
     )
     app.state.runner.start()

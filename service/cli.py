@@ -36,7 +36,8 @@ def main() -> None:
     """Run the command line; other packages' commands are loaded only where one may be meant."""
     own = {command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands}
     wanted = sys.argv[1] if len(sys.argv) > 1 else "--help"
-    if wanted not in own | {"cameras", "keys"}:
+    own |= {group.name for group in app.registered_groups}
+    if wanted not in own:
         for entry_point in entry_points(group=GROUP):
             _add_commands(entry_point)
     app()
@@ -63,12 +64,10 @@ def serve(
         listener = server.bind(settings.host, settings.port)
         load_model_folder(settings.served_model_dir)
         served = create_app(settings)
-        if settings.is_database_embedded:
-            _require_sound(settings)
-            with _migrated(settings):
-                pass
-        if settings.wants_keys:
-            _require_key(settings)
+        _require_sound(settings)
+        with _opened(settings) as engine:
+            if settings.wants_keys:
+                _require_key(settings, engine)
     typer.echo(f"camind on http://{settings.host}:{listener.getsockname()[1]}", err=True)
     if not (settings.is_loopback or settings.wants_keys):
         typer.echo("Other machines can reach it, and it asks nobody who they are.", err=True)
@@ -81,7 +80,7 @@ def migrate() -> None:
     """Bring the database to the newest schema."""
     from service.storage import schema
 
-    with _plain_failures(), _migrated(_settings()) as engine:
+    with _plain_failures(), _opened(_settings(), is_migrated=True) as engine:
         typer.echo(f"The database is at {schema.current_revision(engine)}.")
 
 
@@ -182,7 +181,7 @@ def calibrate(
     from service.inference.images import ImageLimits
 
     settings = _settings()
-    limits = ImageLimits(settings.max_image_bytes, settings.max_image_pixels, settings.max_image_aspect)
+    limits = ImageLimits.of(settings)
     with _plain_failures():
         try:
             grid = CircleGrid(kind, rows, columns, spacing_mm, diameter_mm)
@@ -300,48 +299,40 @@ def _settings(**overrides: object) -> Settings:
         raise _failure(str(exc), WRONG_USE) from exc
 
 
-def _require_key(settings: Settings) -> None:
+def _require_key(settings: Settings, engine: Engine) -> None:
     from service.storage.keys import Keys
 
-    with _opened(settings) as engine:
-        if not Keys(engine).has_good():
-            raise _failure(
-                f"Requests to {settings.host} need an API key, and there is none: make one with `camind keys create "
-                "NAME`, or set CAMIND_API_KEYS=off to let everybody in.",
-                WRONG_USE,
-            )
+    if not Keys(engine).has_good():
+        raise _failure(
+            f"Requests to {settings.host} need an API key, and there is none: make one with `camind keys create NAME`, "
+            "or set CAMIND_API_KEYS=off to let everybody in.",
+            WRONG_USE,
+        )
 
 
 @contextmanager
-def _opened(settings: Settings) -> Iterator[Engine]:
-    """The configured database, which nobody restores meanwhile."""
+def _opened(settings: Settings, *, is_migrated: bool = False) -> Iterator[Engine]:
+    """The configured database, which nobody restores meanwhile; one that others share is migrated only where asked."""
+    from service.storage import schema
     from service.storage.backup import using
     from service.storage.engine import open_engine
 
     with using(settings.effective_database_url):
         engine = open_engine(settings.effective_database_url)
         try:
+            if is_migrated or settings.is_database_embedded:
+                schema.upgrade(engine)
             yield engine
         finally:
             engine.dispose()
 
 
 @contextmanager
-def _migrated(settings: Settings) -> Iterator[Engine]:
-    from service.storage import schema
-
-    with _opened(settings) as engine:
-        schema.upgrade(engine)
-        yield engine
-
-
-@contextmanager
 def _ready_engine() -> Iterator[Engine]:
-    """The configured database, at the newest schema; one that others share is not migrated in passing."""
+    """The configured database, at the newest schema."""
     from service.storage import schema
 
-    settings = _settings()
-    with _migrated(settings) if settings.is_database_embedded else _opened(settings) as engine:
+    with _opened(_settings()) as engine:
         schema.require_head(engine)
         yield engine
 

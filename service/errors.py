@@ -23,7 +23,6 @@ CamindError
 Domain code raises these and knows no HTTP beyond the class; one handler turns them into problem+json.
 """
 
-# ruff: noqa: N818  (the names say what went wrong, and all of them are errors)
 from dataclasses import dataclass
 from typing import ClassVar
 

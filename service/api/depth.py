@@ -123,7 +123,7 @@ async def estimate_depth(
     upload = await receive_photograph(request, settings.max_image_bytes)
     record = await run_in_threadpool(cameras.get, query.camera)
     camera, warnings = _focused(_with_focal_length(record), query.focus_distance_m)
-    limits = ImageLimits(settings.max_image_bytes, settings.max_image_pixels, settings.max_image_aspect)
+    limits = ImageLimits.of(settings)
     order = Order(upload, record, camera, query, chosen, limits, warnings)
     outcome = await _unless_gone(request, worker.run(fulfil, order, estimator))
     if outcome is None:

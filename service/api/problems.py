@@ -8,13 +8,16 @@ from pydantic import BaseModel, Field
 from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
-from service.errors import BadRequest, CamindError, FieldProblem
+from service.errors import BadRequest, Busy, CamindError, FieldProblem, InsufficientStorage, NotReady
 
 PROBLEM_TYPE = "application/problem+json"
 # where a scope says which problem it was answered with
 PROBLEM_KEY = "camind.problem"
 TYPE_PREFIX = "urn:camind:problem:"
 MAX_ERRORS = 50
+# what reading the database may answer, and what writing to it may
+STORE_ERRORS = (Busy, NotReady)
+WRITE_ERRORS = (*STORE_ERRORS, InsufficientStorage)
 
 
 class ProblemField(BaseModel):

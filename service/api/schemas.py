@@ -6,7 +6,6 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from service.errors import BadRequest, FieldProblem
-from service.inference.drafting import Draft
 from service.optics.camera import Camera, Intrinsics, Lens
 from service.storage.cameras import DEFAULT_K_R, NAME_PATTERN, CameraDraft, CameraRecord
 
@@ -200,25 +199,6 @@ class CameraDraftRead(BaseModel):
     gamma_px: Annotated[float, Field(description="The default: no photograph's EXIF tells it")] = 0.5
     lens: LensDraft
     warnings: Annotated[list[str], Field(description="What is missing, and what is no more than a guess")]
-
-    @classmethod
-    def from_draft(cls, draft: Draft) -> Self:
-        """The draft on the wire."""
-        lens = LensDraft(
-            focal_length_mm=draft.focal_length_mm,
-            f_number=draft.f_number,
-            pixel_pitch_um=draft.pixel_pitch_um,
-            sensor_width_px=draft.sensor_width_px,
-        )
-        return cls(
-            name=draft.name,
-            description=draft.description,
-            image_width_px=draft.image_width_px,
-            image_height_px=draft.image_height_px,
-            focus_distance_m=draft.focus_distance_m,
-            lens=lens,
-            warnings=list(draft.warnings),
-        )
 
 
 class RangeRead(BaseModel):

@@ -23,18 +23,25 @@ ASPECT_TOLERANCE = 0.02
 
 
 @dataclass(frozen=True, slots=True)
+class LensGuess:
+    """Lens specs; None for what the photograph does not tell. Lengths in the units of their names."""
+
+    focal_length_mm: float | None
+    f_number: float | None
+    pixel_pitch_um: float | None
+    sensor_width_px: int
+
+
+@dataclass(frozen=True, slots=True)
 class Draft:
-    """A camera to be; None for what the photograph does not tell. Lengths in the units of their names."""
+    """A camera to be; None for what the photograph does not tell."""
 
     name: str
     description: str | None
     image_width_px: int
     image_height_px: int
     focus_distance_m: float | None
-    focal_length_mm: float | None
-    f_number: float | None
-    pixel_pitch_um: float | None
-    sensor_width_px: int | None
+    lens: LensGuess
     warnings: tuple[str, ...]
 
 
@@ -63,10 +70,12 @@ def draft_camera(exif: Exif, width_px: int, height_px: int) -> Draft:
         image_width_px=width_px,
         image_height_px=height_px,
         focus_distance_m=_focus_m(exif, warnings),
-        focal_length_mm=exif.focal_length_mm,
-        f_number=exif.f_number,
-        pixel_pitch_um=width_mm and round(1e3 * width_mm / sensor_width_px, 4),
-        sensor_width_px=sensor_width_px,
+        lens=LensGuess(
+            exif.focal_length_mm,
+            exif.f_number,
+            width_mm and round(1e3 * width_mm / sensor_width_px, 4),
+            sensor_width_px,
+        ),
         warnings=tuple(warnings),
     )
 

@@ -6,12 +6,13 @@ decoded in a process of their own.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service import PIXEL_CEILING
+from service.config import Settings
 from service.errors import InvalidImage, TooLarge, UnsupportedKind
 from service.inference.headers import Header, Kind, read_header
 from service.inference.isolated import decode_isolated
@@ -53,6 +54,11 @@ class ImageLimits:
     max_bytes: int = 32 * 2**20
     max_pixels: int = 64_000_000
     max_aspect: float = 10.0
+
+    @classmethod
+    def of(cls, settings: Settings) -> Self:
+        """What the operator chose."""
+        return cls(settings.max_image_bytes, settings.max_image_pixels, settings.max_image_aspect)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,8 +14,9 @@ from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
-from sqlalchemy import URL, make_url
+from sqlalchemy import URL, Select, column, func, make_url, select, table
 
 from service.errors import NotReady
 from service.storage import schema
@@ -199,10 +200,15 @@ def _contents(file: Path) -> Contents:
         revision = None
         if schema.VERSION_TABLE in names:
             names.remove(schema.VERSION_TABLE)
-            row = connection.execute(f"SELECT version_num FROM {schema.VERSION_TABLE}").fetchone()  # noqa: S608
-            revision = row and row[0]
-        counts = {name: connection.execute(f'SELECT count(*) FROM "{name}"').fetchone()[0] for name in names}  # noqa: S608
+            revision = _first(connection, select(column("version_num")).select_from(table(schema.VERSION_TABLE)))
+        counts = {name: _first(connection, select(func.count()).select_from(table(name))) for name in names}
     return Contents(revision, counts)
+
+
+def _first(connection: sqlite3.Connection, query: Select[Any]) -> Any:
+    """The first value of the first row; None without a row."""
+    row = connection.execute(str(query)).fetchone()
+    return row and row[0]
 
 
 def _require_known(contents: Contents, source: Path) -> None:

@@ -52,46 +52,46 @@ def test_a_number_that_means_unknown_is_none(value: tuple[int, int]) -> None:
 
 def test_a_list_of_cameras_knows_the_sensor() -> None:
     drafted = draft()
-    assert drafted.pixel_pitch_um == pytest.approx(6.05, rel=0.01)
+    assert drafted.lens.pixel_pitch_um == pytest.approx(6.05, rel=0.01)
     assert (drafted.name, drafted.description) == ("nikon-d200-35mm-f2.8", "NIKON D200")
-    assert (drafted.focal_length_mm, drafted.f_number, drafted.sensor_width_px) == (35.0, 2.8, 3872)
+    assert (drafted.lens.focal_length_mm, drafted.lens.f_number, drafted.lens.sensor_width_px) == (35.0, 2.8, 3872)
     assert said(drafted, "crop factor")
     assert said(drafted, "focus_distance_m is needed")
 
 
 def test_the_pixel_pitch_of_the_exif_comes_first() -> None:
     drafted = draft(focal_plane_pitch_um=6.05)
-    assert drafted.pixel_pitch_um == 6.05
+    assert drafted.lens.pixel_pitch_um == 6.05
     assert not said(drafted, "crop")
 
 
 def test_a_pitch_that_cannot_be_is_not_believed() -> None:
     drafted = draft(focal_plane_pitch_um=300.0)
-    assert drafted.pixel_pitch_um == pytest.approx(6.05, rel=0.01)
+    assert drafted.lens.pixel_pitch_um == pytest.approx(6.05, rel=0.01)
     assert said(drafted, "cannot be")
 
 
 def test_the_equivalent_tells_the_sensor_but_is_no_focal_length() -> None:
     drafted = draft(make="Nobody", model="Nothing 1")
-    assert drafted.pixel_pitch_um == pytest.approx(6.05, rel=0.05)
-    assert drafted.focal_length_mm == 35.0
+    assert drafted.lens.pixel_pitch_um == pytest.approx(6.05, rel=0.05)
+    assert drafted.lens.focal_length_mm == 35.0
     assert said(drafted, "35-mm equivalent", "rounded")
     alone = draft(make="Nobody", model="Nothing 1", focal_length_mm=None)
-    assert (alone.focal_length_mm, alone.pixel_pitch_um) == (None, None)
+    assert (alone.lens.focal_length_mm, alone.lens.pixel_pitch_um) == (None, None)
     assert said(alone, "lens.focal_length_mm is needed")
     assert said(alone, "lens.pixel_pitch_um is needed")
 
 
 def test_a_digital_zoom_is_taken_out_of_the_equivalent_and_told() -> None:
     zoomed = draft(make="Nobody", model="Nothing 1", focal_length_35mm=104.0, digital_zoom=2.0)
-    assert zoomed.pixel_pitch_um == pytest.approx(6.05, rel=0.05)
+    assert zoomed.lens.pixel_pitch_um == pytest.approx(6.05, rel=0.05)
     assert said(zoomed, "digital zoom")
 
 
 def test_a_file_made_small_belongs_to_the_whole_sensor() -> None:
     drafted = draft(645, 432)
-    assert (drafted.image_width_px, drafted.sensor_width_px) == (645, 3872)
-    assert drafted.pixel_pitch_um == pytest.approx(6.05, rel=0.01)
+    assert (drafted.image_width_px, drafted.lens.sensor_width_px) == (645, 3872)
+    assert drafted.lens.pixel_pitch_um == pytest.approx(6.05, rel=0.01)
     assert said(drafted, "resized")
 
 
@@ -109,7 +109,7 @@ def test_where_it_was_focused_is_taken_with_care() -> None:
 def test_without_exif_everything_is_missing_and_named() -> None:
     drafted = draft_camera(Exif(), 640, 480)
     assert (drafted.name, drafted.description) == ("camera", None)
-    assert (drafted.image_width_px, drafted.image_height_px, drafted.sensor_width_px) == (640, 480, 640)
+    assert (drafted.image_width_px, drafted.image_height_px, drafted.lens.sensor_width_px) == (640, 480, 640)
     for field in ("focus_distance_m", "lens.focal_length_mm", "lens.f_number", "lens.pixel_pitch_um"):
         assert said(drafted, f"{field} is needed")
 
