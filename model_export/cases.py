@@ -23,8 +23,10 @@ from service.optics.camera import Camera, Intrinsics, Lens
 
 FRAME_FX_PX = 525.0
 UNSEEN_K_CAM_PX = (2.64, 3.81, 6.80, 10.7)
+FAR_K_CAM_PX = (1.0, 20.0, 60.0)
+FOCUS_DISTANCES_M = (0.6, 1.0, 4.0)
 PLANES_M = (0.7, 1.0, 1.5)
-VIEWS = (0.6, 0.8)
+VIEWS = (0.6, 0.8, 1.5)
 NEAR_LIMIT_M = 2.0
 LEAST_SCORED = 0.02
 D200 = Lens(35.0, 2.8, 6.05, 3872)
@@ -105,11 +107,11 @@ def _to_limit(depth_m: Map) -> Map:
         return np.where(depth_m <= NEAR_LIMIT_M, depth_m, np.float32(np.nan)).astype(np.float32)
 
 
-def refocused_cases(folder: Path, count: int, camera: Camera = REFERENCE) -> Iterator[Case]:
+def refocused_cases(folder: Path, count: int, camera: Camera = REFERENCE, side: Side = "near") -> Iterator[Case]:
     """Sharp frames with depth, refocused with a camera; scored to 2 m."""
     for photo in _spread(folder, count):
         picture = to_pixels(refocus(_encoded(photo), filled(photo.depth_m), camera))
-        yield Case(photo.name, picture, _to_limit(photo.depth_m), camera, "near")
+        yield Case(photo.name, picture, _to_limit(photo.depth_m), camera, side)
 
 
 def shuffled_cases(folder: Path, count: int) -> Iterator[Case]:
@@ -125,18 +127,21 @@ def shuffled_cases(folder: Path, count: int) -> Iterator[Case]:
             yield Case(photo.name, picture, _to_limit(photo.depth_m), REFERENCE, "near")
 
 
-def narrowed_cases(folder: Path, count: int, view: float) -> Iterator[Case]:
-    """Frames cut to the middle ``view`` of their width and enlarged again: a longer lens with the same k_cam."""
+def viewed_cases(folder: Path, count: int, view: float) -> Iterator[Case]:
+    """Frames of another field of view with the same k_cam: their middle enlarged, or the whole made smaller."""
     for photo in _spread(folder, count):
         height, width = photo.image.shape[:2]
-        top, left = round(height * (1 - view) / 2), round(width * (1 - view) / 2)
+        top, left = (max(0, round(size * (1 - view) / 2)) for size in (height, width))
         cut = (slice(top, height - top), slice(left, width - left))
-        picture = cv2.resize(_encoded(photo)[cut], (width, height), interpolation=cv2.INTER_CUBIC)
-        depth = cv2.resize(photo.depth_m[cut], (width, height), interpolation=cv2.INTER_NEAREST)
-        camera = replace(REFERENCE, intrinsics=_centred(FRAME_FX_PX / view, width, height))
-        depth_m = np.asarray(depth, np.float32)
-        blurred = refocus(np.clip(np.asarray(picture, np.float32), 0, 1), filled(depth_m), camera)
-        yield Case(photo.name, to_pixels(blurred), _to_limit(depth_m), camera, "near")
+        shrink = max(1.0, view)
+        size = (round(width / shrink), round(height / shrink))
+        how = cv2.INTER_CUBIC if view < 1 else cv2.INTER_AREA
+        picture = cv2.resize(_encoded(photo)[cut], size, interpolation=how)
+        depth = np.asarray(cv2.resize(photo.depth_m[cut], size, interpolation=cv2.INTER_NEAREST), np.float32)
+        camera = replace(REFERENCE, image_width_px=size[0], image_height_px=size[1])
+        camera = replace(camera, intrinsics=_centred(FRAME_FX_PX / view, *size))
+        blurred = refocus(np.clip(np.asarray(picture, np.float32), 0, 1), filled(depth), camera)
+        yield Case(photo.name, to_pixels(blurred), _to_limit(depth), camera, "near")
 
 
 def d200_cases(folder: Path, count: int) -> Iterator[Case]:
@@ -158,9 +163,9 @@ def _near_steps(depth_m: Map) -> NDArray[np.bool_]:
     return np.asarray(cv2.dilate(step, np.ones((size, size), np.uint8))) > 0
 
 
-def procedural_cases(count: int, side: int) -> Iterator[Case]:
+def procedural_cases(count: int, side: int, first: int = 0) -> Iterator[Case]:
     """Procedural scenes of seeds and textures that no training drew: all nearer (-1), farther (1), or both (0)."""
-    drawn = (draw_sample(HELD_OUT_SEED + number, SceneConfig(), []) for number in itertools.count())
+    drawn = (draw_sample(HELD_OUT_SEED + number, SceneConfig(), []) for number in itertools.count(first))
     for sample in itertools.islice((s for s in drawn if s.shot.side == side), count):
         shot = sample.shot
         height, width = sample.excess.shape
@@ -211,30 +216,48 @@ def _enough(source: CaseSource) -> Iterator[Case]:
 
 def trials(data: Path, quick: bool) -> list[Trial]:
     """The sets that the data folder can serve; a missing folder is a missing set."""
-    few, several, many, scenes = (2, 2, 4, 8) if quick else (8, 20, 40, 60)
-    found: list[Trial] = []
-
-    def add(name: str, source: CaseSource, *further_modes: str) -> None:
-        found.append(Trial(name, partial(_enough, source), ("gt", *further_modes)))
-
-    add(FIXED, fixed_cases)
-    for name, side in PROCEDURAL_SIDES.items():
-        add(f"procedural {name}", partial(procedural_cases, scenes, side))
+    few, many, scenes = (2, 4, 8) if quick else (8, 40, 60)
+    found = [_trial(FIXED, fixed_cases)]
+    found += [
+        _trial(f"procedural {n}", partial(procedural_cases, scenes, side)) for n, side in PROCEDURAL_SIDES.items()
+    ]
     if (data / "blender" / "cameras.json").is_file():
-        add("blender", partial(blender_cases, data / "blender", 2 * scenes))
+        found.append(_trial("blender", partial(blender_cases, data / "blender", 2 * scenes)))
     indoor = [data / name for name in ("rgbd", "tabletop") if (data / name).is_dir()]
     if len(indoor) == 2:
-        for depth_m in PLANES_M:
-            add(f"plane {depth_m:g} m", partial(plane_cases, data, depth_m, few))
+        found += [_trial(f"plane {depth_m:g} m", partial(plane_cases, data, depth_m, few)) for depth_m in PLANES_M]
     for folder in indoor:
-        for k_cam_px in (REFERENCE.k_cam_px,) if quick else UNSEEN_K_CAM_PX:
-            camera = replace(REFERENCE, k_cam_px=k_cam_px)
-            further = ("no k_cam", "k_cam -10%", "k_cam +10%") if camera == REFERENCE else ("no k_cam",)
-            count = many if camera == REFERENCE else several
-            add(f"{folder.name} k_cam {k_cam_px:g}", partial(refocused_cases, folder, count, camera), *further)
-        add(f"{folder.name} shuffled", partial(shuffled_cases, folder, several))
-        for view in VIEWS:
-            add(f"{folder.name} view {view:g}", partial(narrowed_cases, folder, several, view))
+        found += _indoor_trials(folder, quick)
     if (data / "d200").is_dir():
-        add("d200", partial(d200_cases, data / "d200", 2 * many))
+        found.append(_trial("d200", partial(d200_cases, data / "d200", 2 * many)))
+    return found
+
+
+def _trial(name: str, source: CaseSource, *further_modes: str) -> Trial:
+    return Trial(name, partial(_enough, source), ("gt", *further_modes))
+
+
+def _indoor_trials(folder: Path, quick: bool) -> list[Trial]:
+    """Sharp frames refocused by several cameras, at other distances of focus and in other fields of view."""
+    few, several, many = (2, 2, 4) if quick else (8, 20, 40)
+
+    def by(camera: Camera, count: int, side: Side = "near") -> CaseSource:
+        return partial(refocused_cases, folder, count, camera, side)
+
+    found = []
+    for k_cam_px in (REFERENCE.k_cam_px,) if quick else UNSEEN_K_CAM_PX:
+        camera = replace(REFERENCE, k_cam_px=k_cam_px)
+        further = ("no k_cam", "k_cam -10%", "k_cam +10%") if camera == REFERENCE else ("no k_cam",)
+        count = many if camera == REFERENCE else several
+        found.append(_trial(f"{folder.name} k_cam {k_cam_px:g}", by(camera, count), *further))
+    found.append(_trial(f"{folder.name} shuffled", partial(shuffled_cases, folder, several)))
+    for view in VIEWS:
+        found += [_trial(f"{folder.name} view {view:g}", partial(viewed_cases, folder, several, view))]
+    if quick:
+        return found
+    for k_cam_px in FAR_K_CAM_PX:
+        found += [_trial(f"{folder.name} k_cam {k_cam_px:g}", by(replace(REFERENCE, k_cam_px=k_cam_px), few))]
+    for focus_m in FOCUS_DISTANCES_M:
+        camera = replace(REFERENCE, focus_distance_m=focus_m)
+        found.append(_trial(f"{folder.name} focus {focus_m:g} m", by(camera, few, "auto")))
     return found

@@ -114,11 +114,13 @@ def export(
     with _training_parts():
         from model_export.export import export_checkpoint
         from model_export.quantized import quantised_graphs
+        from model_export.temperature import calibrate
 
     manifest = export_checkpoint(checkpoint, textures, out, name)
-    typer.echo(f"{manifest.name} in {out}")
-    small = export_checkpoint(checkpoint, textures, out / INT8, f"{manifest.name}-{INT8}", quantised_graphs)
-    typer.echo(f"{small.name} in {out / INT8}")
+    export_checkpoint(checkpoint, textures, out / INT8, f"{manifest.name}-{INT8}", quantised_graphs)
+    for folder in (out, out / INT8):
+        calibrated = calibrate(folder)
+        typer.echo(f"{calibrated.name} in {folder}, stated errors times {calibrated.temperature:.2f}")
 
 
 @commands.command()
@@ -175,7 +177,8 @@ def evaluate(
     if update_card:
         from model_export.card import record_scores
 
-        record_scores(model, report.scores(), reports.markdown(report), "camind evaluate --data DATA")
+        command = "camind evaluate --data DATA" + " --quick" * quick
+        record_scores(model, report.scores(), reports.markdown(report), command)
 
 
 @bench.callback()

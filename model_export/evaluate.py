@@ -19,7 +19,7 @@ from model_export.cores import torch_threads
 from model_export.metrics import Scores, best_constant, completed, mean_scores, pooled_scores, score
 from service.inference.artifact import ModelFolder, load_model_folder
 from service.inference.cancellation import Cancellation
-from service.inference.depth_map import SIGMA_OF_LAPLACE
+from service.inference.depth_map import SIGMA_OF_LAPLACE, DepthMap
 from service.inference.estimator import Estimator
 from service.inference.pair import GraphPair, RawMaps, Stopwatch
 from service.optics.camera import Camera
@@ -36,6 +36,8 @@ BLUR_RANGES_PX = (
     *((0.0, 0.5), (0.5, 1.0), (1.0, 2.0), (2.0, 4.0), (4.0, 8.0), (8.0, 16.0), (16.0, math.inf)),
     *((0.6, 1.0), (1.0, 8.0), (0.0, math.inf)),
 )
+KEPT_SHARES = (1.0, 0.75, 0.5, 0.25, 0.1)
+CLEARLY_OUT = 0.25  # |x| from where on the side of focus is asked for
 SAMPLED_PIXELS = 3000
 REMEMBERED = 4
 SETS_AT_ONCE = 2
@@ -66,14 +68,43 @@ class Pixels:
         error, least_certain = np.abs(self.error), ~self.certain(0.5)
         return float(error[self.certain(0.1)].mean() / error[least_certain].mean()) if least_certain.any() else 1.0
 
+    def within(self, deviations: float) -> float:
+        """The share of pixels whose truth lies within so many stated deviations of the answer."""
+        return float((np.abs(self.truth / self.answer - 1) <= deviations * self.stated).mean())
+
+    def kept_error(self, share: float) -> float:
+        """The mean error of the share of the pixels that is most certain."""
+        return float(np.abs(self.error)[self.certain(share)].mean())
+
     @staticmethod
     def joined(parts: Sequence["Pixels"]) -> "Pixels":
         return Pixels(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("truth", "answer", "stated")))
 
 
 @dataclass(frozen=True, slots=True)
+class Sides:
+    """Of pixels visibly out of focus: the share on the right side, and with either hypothesis within two deviations."""
+
+    right: float
+    either: float
+    pixels: int
+
+    @staticmethod
+    def joined(parts: Sequence["Sides"]) -> "Sides | None":
+        """All of them together; None for none."""
+        pixels = [part.pixels for part in parts]
+        if not any(pixels):
+            return None
+        right, either = np.average([(part.right, part.either) for part in parts], axis=0, weights=pixels).tolist()
+        return Sides(right, either, sum(pixels))
+
+
+@dataclass(frozen=True, slots=True)
 class Outcome:
-    """What one picture scored, what the best constant depth would have, and the share of scored pixels answered."""
+    """What one picture scored, what the best constant depth would have, and the share of scored pixels answered.
+
+    ``sides`` is None where the side was told.
+    """
 
     scores: Scores
     constant: Scores
@@ -82,6 +113,7 @@ class Outcome:
     median_error: float
     depth: Pixels
     blur: Pixels | None
+    sides: Sides | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +121,8 @@ class Summary:
     """A set's scores in one mode, beside the best constant depth of each picture.
 
     ``certain_abs_rel`` is that of the half of the pixels with the least stated error; ``order`` is the mean error
-    of the most certain tenth over that of the least certain half.
+    of the most certain tenth over that of the least certain half; ``kept_abs_rel`` has the errors of the most certain
+    shares ``KEPT_SHARES``, and ``within`` the shares of truths within one and two stated deviations.
     """
 
     name: str
@@ -103,12 +136,17 @@ class Summary:
     median_error: float
     certain_abs_rel: float
     order: float
+    kept_abs_rel: tuple[float, ...]
+    within: tuple[float, float]
+    sides: Sides | None
     depth: Pixels
 
     def as_dict(self) -> dict[str, object]:
         plain = ("name", "mode", "pictures", "answered", "median_error", "certain_abs_rel", "order")
         tables = ("pooled", "mean", "constant_pooled", "constant_mean")
-        return {n: getattr(self, n) for n in plain} | {n: getattr(self, n).as_dict() for n in tables}
+        shares = {"kept_abs_rel": dict(zip(KEPT_SHARES, self.kept_abs_rel, strict=True)), "within": self.within}
+        sides = {"sides": asdict(self.sides) if self.sides else None}
+        return {n: getattr(self, n) for n in plain} | {n: getattr(self, n).as_dict() for n in tables} | shares | sides
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,6 +251,7 @@ class Examiner:
             median_error=float(abs(np.median(depth / truth) - 1)),
             depth=Pixels(truth[some], depth[some], stated[some]),
             blur=self._blur(case, camera) if mode == "gt" else None,
+            sides=_sides(case, told) if case.side == "auto" else None,
         )
         return outcome, Example(case.image, case.truth_m, told.depth_m, told.sigma_m)
 
@@ -227,12 +266,24 @@ class Examiner:
         return Pixels(truth[known], maps["blur_px"][known], stated[known])
 
 
+def _sides(case: Case, told: DepthMap) -> Sides:
+    focus_m = case.camera.focus_distance_m
+    with np.errstate(invalid="ignore"):
+        out = np.abs(focus_m / case.truth_m - 1) > CLEARLY_OUT
+        asked = out & np.isfinite(told.depth_m)
+        truth, depth, alt = case.truth_m[asked], told.depth_m[asked], told.depth_alt_m[asked]
+        reach = 2 * told.sigma_m[asked] / depth
+        either = (np.abs(truth / depth - 1) <= reach) | (np.abs(truth / alt - 1) <= reach)
+    if not asked.any():
+        return Sides(0.0, 0.0, 0)
+    return Sides(float(((depth < focus_m) == (truth < focus_m)).mean()), float(either.mean()), int(asked.sum()))
+
+
 def summarise(name: str, mode: str, outcomes: Sequence[Outcome]) -> Summary:
     """A set's figures; raises ``ValueError`` for an empty set."""
     if not outcomes:
         raise ValueError(f"{name}: no picture to score")
     depth = Pixels.joined([o.depth for o in outcomes])
-    error = np.abs(depth.error)
     weights = [o.scored_pixels for o in outcomes]
     return Summary(
         name=name,
@@ -244,8 +295,11 @@ def summarise(name: str, mode: str, outcomes: Sequence[Outcome]) -> Summary:
         constant_pooled=pooled_scores([o.constant for o in outcomes], weights),
         constant_mean=mean_scores([o.constant for o in outcomes]),
         median_error=float(np.median([o.median_error for o in outcomes])),
-        certain_abs_rel=float(error[depth.certain(0.5)].mean()),
+        certain_abs_rel=depth.kept_error(0.5),
         order=depth.order,
+        kept_abs_rel=tuple(depth.kept_error(share) for share in KEPT_SHARES),
+        within=(depth.within(1), depth.within(2)),
+        sides=Sides.joined([o.sides for o in outcomes if o.sides is not None]),
         depth=depth,
     )
 

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from model_export.cases import UNSEEN_K_CAM_PX, VIEWS
-from model_export.evaluate import MODES, BlurRange, Pixels, Report, Summary
+from model_export.evaluate import KEPT_SHARES, MODES, BlurRange, Pixels, Report, Summary
 from service.inference.preview import render_preview
 
 Table = tuple[list[str], list[list[str]]]
@@ -23,6 +23,10 @@ Map = NDArray[np.float32]
 DEPTH_HEAD = [
     *("set", "camera", "pictures", "answered", "AbsRel", "constant", "certain half", "order"),
     *("pooled RMSE", "constant", "median error"),
+]
+CERTAINTY_HEAD = [
+    *("set", "camera", "within sigma", "within 2 sigma", *(f"surest {share:.0%}" for share in KEPT_SHARES)),
+    *("right side", "either"),
 ]
 SCORES_HEAD = ["set", "camera", "over", "AbsRel", "MSE", "RMSE", "log10", "delta1", "delta2", "delta3"]
 BLUR_HEAD = ["scenes", "lambda px", "pixels", "median error", "certain half", "90th percentile", "bias", "order"]
@@ -43,6 +47,11 @@ def _depth_row(s: Summary) -> list[str]:
     ]
 
 
+def _certainty_row(s: Summary) -> list[str]:
+    sides = (f"{s.sides.right:.1%}", f"{s.sides.either:.1%}") if s.sides else ("", "")
+    return [*_camera(s), *(f"{v:.1%}" for v in s.within), *(f"{v:.3f}" for v in s.kept_abs_rel), *sides]
+
+
 def _score_rows(s: Summary) -> list[list[str]]:
     ways = {"pixels": s.pooled, "pictures": s.mean}
     return [[*_camera(s), way, *(f"{v:.3f}" for v in scores.as_dict().values())] for way, scores in ways.items()]
@@ -58,6 +67,7 @@ def tables(report: Report) -> dict[str, Table]:
     """Title to head and rows, as text."""
     return {
         "Depth": (DEPTH_HEAD, [_depth_row(s) for s in report.sets]),
+        "Certainty": (CERTAINTY_HEAD, [_certainty_row(s) for s in report.sets if s.mode == "gt"]),
         "All scores of depth": (SCORES_HEAD, [row for s in report.sets for row in _score_rows(s)]),
         "Blur": (BLUR_HEAD, [_blur_row(b) for b in report.blur]),
     }

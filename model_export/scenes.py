@@ -14,15 +14,14 @@ from numpy.typing import NDArray
 
 from model_export.config import SceneConfig
 from model_export.render import PIXEL_BOX_VARIANCE, Layer, PointSpread, blur, render_layers
+from model_export.rooms import Surface, draw_room
 from model_export.textures import draw_texture
 from service.optics import thin_lens
 from service.optics.light import decode_srgb, encode_srgb
 
 SIDES = ("near", "far", "both")
 SIDE_SHARES = (0.45, 0.2, 0.35)
-ROOM_SHARE = 0.35
-WALL_SHARE = 0.6
-ROLL = 0.2
+ROOM_SHARE = 0.5
 LAYERED_SHARE = 0.7
 NEAREST_AT_MOST, FARTHEST_AT_LEAST = 0.5, 2.0
 CLOSE_SHARE = 0.5
@@ -38,7 +37,6 @@ PLAIN_SHARE = 0.35  # not compressed: the network must not need the noise of JPE
 RESCALED_SHARE = 0.15
 RESCALES = (1.2, 1.6)
 Map = NDArray[np.float32]
-Surface = tuple[Map, Map]  # alpha and q - 1 over the canvas
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,8 +155,8 @@ def _outline(rng: np.random.Generator, size: int) -> Map:
     return np.asarray(small, np.float32) / np.float32(255)
 
 
-def _apart(rng: np.random.Generator, shot: Shot, config: SceneConfig, count: int, size: int) -> list[Surface]:
-    """Shapes before a background, nearest first, at depths that have little to do with where they are."""
+def _apart(rng: np.random.Generator, shot: Shot, config: SceneConfig, count: int, size: int) -> list[tuple[Map, Map]]:
+    """Alpha and q - 1 of shapes before a background, nearest first, at depths that say little of where they are."""
     bounds = _excess_bounds(shot, config)
     first, *others = (_draw_excess(rng, shot, config) for _ in range(count))
     apart = rng.uniform(0, 1) if rng.random() < CLOSE_SHARE else 1.0  # what stands together is often alike in depth
@@ -167,44 +165,41 @@ def _apart(rng: np.random.Generator, shot: Shot, config: SceneConfig, count: int
     return [*((_outline(rng, size), shape) for shape in shapes), (np.ones((size, size), np.float32), background)]
 
 
-def _room(rng: np.random.Generator, shot: Shot, config: SceneConfig, count: int, size: int) -> list[Surface]:
-    """Shapes that stand on a floor or a table, before a wall or none, nearest first: what is lower is nearer."""
-    far, near = sorted(_draw_excess(rng, shot, config) for _ in range(2))
-    roll = rng.normal(0, ROLL)
-    u = np.linspace(-1, 1, size, dtype=np.float32)[None, :]
-    down = math.cos(roll) * u.T + math.sin(roll) * u
-    ground = np.clip((far + near) / 2 + (near - far) / 2 * down, far, near)
-    if rng.random() < WALL_SHARE:
-        ground = np.maximum(ground, np.float32(far + rng.uniform(0, 0.7) * (near - far)))
-    standing = []
-    for outline in (_outline(rng, size) for _ in range(count - 1)):
-        rows, columns = np.nonzero(outline > 0.5)
-        if len(rows):
-            foot = rows.argmax()
-            standing.append((float(ground[rows[foot], columns[foot]]), outline))
-    standing.sort(key=lambda thing: -thing[0])
-    upright = [(outline, np.full((size, size), excess, np.float32)) for excess, outline in standing]
-    return [*upright, (np.ones((size, size), np.float32), np.asarray(ground, np.float32))]
-
-
 def draw_layers(
     rng: np.random.Generator, shot: Shot, config: SceneConfig, photographs: list[NDArray[np.uint8]]
 ) -> tuple[list[Layer], Map]:
     """The scene's surfaces, nearest first, and q - 1 of each over the canvas [layers,h,w]."""
     size = config.size_px + 2 * config.margin_px
-    count = int(rng.integers(1, config.max_layers + 1)) if rng.random() < LAYERED_SHARE else 1
-    surfaces = (_room if rng.random() < ROOM_SHARE else _apart)(rng, shot, config, count, size)
-    layers: list[Layer] = []
-    for alpha, excess in surfaces:
-        color = decode_srgb(draw_texture(rng, photographs, size)) * alpha[..., None]
-        layers.append(
-            Layer(
-                torch.from_numpy(color.transpose(2, 0, 1).copy()),
-                torch.from_numpy(alpha)[None],
-                torch.from_numpy(-excess * np.float32(shot.k_cam_px)),
-            )
+
+    def draw(texture_size: int) -> Map:
+        return draw_texture(rng, photographs, texture_size)
+
+    if rng.random() < ROOM_SHARE:
+        far, near = sorted(_draw_excess(rng, shot, config) for _ in range(2))
+        surfaces = draw_room(
+            rng,
+            draw,
+            ends=(far, near),
+            bounds=_excess_bounds(shot, config),
+            focal_px=shot.focal_length_px,
+            count=int(rng.integers(1, config.max_layers + 3)),
+            size=size,
         )
-    return layers, np.stack([excess for _, excess in surfaces])
+    else:
+        count = int(rng.integers(1, config.max_layers + 1)) if rng.random() < LAYERED_SHARE else 1
+        surfaces = [
+            Surface(decode_srgb(draw(size)) * alpha[..., None], alpha, excess)
+            for alpha, excess in _apart(rng, shot, config, count, size)
+        ]
+    layers = [
+        Layer(
+            torch.from_numpy(surface.color.transpose(2, 0, 1).copy()),
+            torch.from_numpy(surface.alpha)[None],
+            torch.from_numpy(-surface.excess * np.float32(shot.k_cam_px)),
+        )
+        for surface in surfaces
+    ]
+    return layers, np.stack([surface.excess for surface in surfaces])
 
 
 def _through_mosaic(linear: Map) -> Map:

@@ -47,6 +47,10 @@ class Server:
         self._wait_until_ready()
 
     @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.port}/"
+
+    @property
     def log(self) -> str:
         return self._log.read_text()
 

@@ -1,4 +1,4 @@
-"""Who may do what: API keys in front of every request but those for health, their scopes, and a quota for each.
+"""Who may do what: API keys in front of every request but those for health and the page, their scopes, and their quota.
 
 A scope is asked for by path, before a route or a body is looked at; a path that is not named here takes any key.
 """
@@ -18,7 +18,9 @@ from service.principal import ANYBODY, Principal
 from service.principal import Scope as KeyScope
 from service.storage.keys import ApiKey, Keys
 
-PUBLIC = "/health"
+# the page holds nobody's data, and is what asks for the key
+PAGE = "/"
+PUBLIC = ("/health", "/web")
 READING = frozenset({"GET", "HEAD", "OPTIONS"})
 # below each path: the scope to read, and the scope to do anything else; the longest path that fits counts
 SCOPES_BY_PATH: dict[str, tuple[KeyScope | None, KeyScope | None]] = {
@@ -30,6 +32,8 @@ SCOPES_BY_PATH: dict[str, tuple[KeyScope | None, KeyScope | None]] = {
     "/calibrations": ("calibrate", "calibrate"),
     "/metrics": ("admin", "admin"),
 }
+# what only reads, though it is sent
+SCOPES_OF_READING: dict[tuple[str, str], KeyScope] = {("POST", "/cameras/preview"): "cameras:read"}
 
 
 class Authenticate:
@@ -78,11 +82,13 @@ class Authenticate:
 
 def is_public(path: str) -> bool:
     """Whether the path answers without a key."""
-    return _is_below(path, PUBLIC)
+    return path == PAGE or any(_is_below(path, prefix) for prefix in PUBLIC)
 
 
 def needed_scope(method: str, path: str) -> KeyScope | None:
     """The scope a key must have for this; None where any key will do."""
+    if (method, path) in SCOPES_OF_READING:
+        return SCOPES_OF_READING[method, path]
     fitting = [prefix for prefix in SCOPES_BY_PATH if _is_below(path, prefix)]
     if not fitting:
         return None

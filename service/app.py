@@ -9,7 +9,7 @@ from fastapi import FastAPI
 from fastapi_offline import FastAPIOffline
 
 from service.access import Authenticate
-from service.api import calibrations, cameras, depth, handlers, health, metrics, model, openapi, pages, target
+from service.api import calibrations, cameras, depth, handlers, health, look, metrics, model, openapi, pages, target
 from service.calibration.calibrate import calibrate
 from service.config import Settings
 from service.inference.artifact import load_model_folder
@@ -27,6 +27,7 @@ from service.tracing import Tracing
 
 DEPTH_PATH = "/depth"
 FROM_PHOTO_PATH = "/cameras/from-photo"
+LOOK_PATH = "/calibrate/look"
 CALIBRATE_PATH = "/calibrate"
 DESCRIPTION = """\
 How far away is each pixel of this single photograph, in metres, given the camera that took it?
@@ -64,7 +65,7 @@ def create_app(settings: Settings, calibrate: Calibrate = calibrate) -> FastAPI:
     app.state.is_stopping = False
     _add_middleware(app, settings)
     handlers.install(app)
-    for part in (cameras, depth, calibrations, target, model, health, metrics, pages):
+    for part in (cameras, depth, calibrations, look, target, model, health, metrics, pages):
         app.include_router(part.router)
     # FastAPI's own way to another description: https://fastapi.tiangolo.com/how-to/extending-openapi/
     app.openapi = lambda: openapi.describe(app)  # type: ignore[method-assign]
@@ -80,6 +81,7 @@ def _add_middleware(app: FastAPI, settings: Settings) -> None:
         limits_by_path={
             DEPTH_PATH: photograph,
             FROM_PHOTO_PATH: photograph,
+            LOOK_PATH: photograph,
             CALIBRATE_PATH: BodyLimits(settings.max_calibration_bytes, settings.calibration_receive_deadline_s),
         },
     )

@@ -48,6 +48,7 @@ def serve(
     host: Annotated[str | None, typer.Option(help="Address to bind. [default: 127.0.0.1]")] = None,
     port: Annotated[int | None, typer.Option(help="TCP port, 0 for any. [default: 8000]")] = None,
     model: Annotated[Path | None, typer.Option(help="Model folder. [default: the shipped model]")] = None,
+    seed: Annotated[bool, typer.Option("--seed", help="Give a new database the paper's cameras")] = False,
 ) -> None:
     """Answer requests until stopped. Everything else is set by CAMIND_* variables.
 
@@ -65,7 +66,10 @@ def serve(
         load_model_folder(settings.served_model_dir)
         served = create_app(settings)
         _require_sound(settings)
+        is_seeded = seed and settings.is_database_embedded and not _database_file(settings).exists()
         with _opened(settings) as engine:
+            if is_seeded:
+                _seed(engine, LOCAL)
             if settings.wants_keys:
                 _require_key(settings, engine)
     typer.echo(f"camind on http://{settings.host}:{listener.getsockname()[1]}", err=True)
@@ -208,12 +212,16 @@ def print_version() -> None:
 @cameras_app.command(name="seed")
 def seed_cameras(owner: Annotated[str, typer.Option(help=OWNER_HELP)] = LOCAL) -> None:
     """Store the cameras of the paper's Table 1; names already there are left as they are."""
+    with _plain_failures(), _ready_engine() as engine:
+        names = _seed(engine, owner)
+    typer.echo("\n".join(names) if names else "Every seed is there already.")
+
+
+def _seed(engine: Engine, owner: str) -> list[str]:
     from service.storage.cameras import Cameras
     from service.storage.seeds import seed
 
-    with _plain_failures(), _ready_engine() as engine:
-        names = seed(Cameras(engine, owner))
-    typer.echo("\n".join(names) if names else "Every seed is there already.")
+    return seed(Cameras(engine, owner))
 
 
 @cameras_app.command(name="list")

@@ -15,7 +15,7 @@ from sqlalchemy import Connection, Engine, event
 from starlette.testclient import TestClient
 
 from model_export.served import serving
-from service.access import needed_scope
+from service.access import is_public, needed_scope
 from service.app import create_app
 from service.config import Settings
 from service.errors import BadRequest, NotFound
@@ -27,7 +27,8 @@ from tests.test_cli import camind
 
 PROBLEM = "application/problem+json"
 NOWHERE = "/no-such-thing"
-OPEN = {"/health/live", "/health/ready"}
+PAGE = {"/", "/web/app.js"}
+OPEN = {"/health/live", "/health/ready"} | PAGE
 Part = tuple[str, tuple[str | None, bytes | str, str]]
 CAMERA = {"name": "bench", "image_width_px": 4, "image_height_px": 3, "focus_distance_m": 1.0, "k_cam_px": 2.0}
 
@@ -68,9 +69,10 @@ def operations(app: FastAPI) -> Iterator[tuple[str, str, list[str]]]:
             yield method.upper(), path, scopes
 
 
-def test_every_path_but_health_asks_for_a_key(app: FastAPI, client: TestClient) -> None:
+def test_every_path_but_health_and_the_page_asks_for_a_key(app: FastAPI, client: TestClient) -> None:
     asked = {(method, path.format(name="x", id="0" * 32)) for method, path, _ in operations(app)}
-    for method, path in sorted(asked | {("GET", "/"), ("GET", "/docs"), ("GET", "/openapi.json"), ("GET", NOWHERE)}):
+    others = {("GET", path) for path in ("/docs", "/openapi.json", "/webx", NOWHERE)}
+    for method, path in sorted(asked | others | {("GET", path) for path in PAGE}):
         answer = client.request(method, path)
         if path in OPEN:
             assert answer.status_code == 200
@@ -107,9 +109,15 @@ def test_a_key_opens_what_its_scope_names_and_nothing_else(app: FastAPI, client:
         ("GET", "/cameras", "cameras:read"),
         ("HEAD", "/cameras/a/curve", "cameras:read"),
         ("POST", "/cameras", "cameras:write"),
+        ("POST", "/cameras/preview", "cameras:read"),
+        ("PUT", "/cameras/preview", "cameras:write"),
+        ("DELETE", "/cameras/preview", "cameras:write"),
+        ("GET", "/cameras/a/revisions", "cameras:read"),
         ("PUT", "/cameras/a", "cameras:write"),
         ("DELETE", "/cameras/a", "cameras:write"),
         ("POST", "/calibrate", "calibrate"),
+        ("POST", "/calibrate/look", "calibrate"),
+        ("POST", "/calibrations/a/accept", "calibrate"),
         ("GET", "/calibrations/a/events", "calibrate"),
         ("DELETE", "/calibrations/a", "calibrate"),
         ("GET", "/metrics", "admin"),
@@ -122,10 +130,15 @@ def test_the_scope_of_a_path(method: str, path: str, scope: str | None) -> None:
     assert needed_scope(method, path) == scope
 
 
+@pytest.mark.parametrize("path", ["//", "//cameras", "//web/app.js", "/webcameras", "/healthy", ""])
+def test_a_path_that_is_like_a_public_one_is_not(path: str) -> None:
+    assert not is_public(path)
+
+
 def test_cameras_belong_to_an_owner(client: TestClient, keys: Keys) -> None:
     mine, theirs = bearer(keys, "lab"), bearer(keys, "shop")
     assert client.post("/cameras", json=CAMERA, headers=mine).status_code == 201
-    for method, path in (("GET", ""), ("GET", "/curve"), ("DELETE", "")):
+    for method, path in (("GET", ""), ("GET", "/curve"), ("GET", "/revisions"), ("DELETE", "")):
         refused(client.request(method, f"/cameras/bench{path}", headers=theirs), 404, "not-found")
     body = {field: value for field, value in CAMERA.items() if field != "name"}
     refused(client.put("/cameras/bench", json=body, headers=theirs), 404, "not-found")
@@ -151,6 +164,7 @@ def test_calibrations_belong_to_an_owner_with_the_camera_they_make(client: TestC
     path = answer.headers["location"]
     for method, end in (("GET", ""), ("GET", "/events"), ("GET", "/plot.svg"), ("DELETE", "")):
         refused(client.request(method, path + end, headers=theirs), 404, "not-found")
+    refused(client.post(f"{path}/accept", json={}, headers=theirs), 404, "not-found")
     assert client.get("/calibrations", headers=theirs).json()["items"] == []
     assert len(client.get("/calibrations", headers=mine).json()["items"]) == 1
     assert client.get("/cameras/bench", headers=mine).json()["source"] == "calibration"

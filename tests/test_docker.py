@@ -68,6 +68,7 @@ def test_the_image_holds_no_training(image: Path) -> None:
 def test_the_app_starts_from_the_image_and_serves_the_shipped_model(image: Path, tmp_path: Path) -> None:
     with serving(tmp_path / "data", camind=image / "bin" / "camind") as server:
         assert server.ask("GET", "/model").json()["manifest"]["kind"] == "compact"
+        assert server.ask("GET", "/web/vendor/preact.js").status == 200
 
 
 def test_training_commands_are_refused_in_plain_words_without_torch(image: Path, tmp_path: Path) -> None:

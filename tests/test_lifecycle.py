@@ -138,3 +138,17 @@ def test_postgresql_has_its_own_commands(tmp_path: Path, command: str) -> None:
     )
     assert done.returncode == 2
     assert "pg_dump and pg_restore" in done.stderr
+
+
+def test_a_new_database_is_seeded_once(tmp_path: Path, tiny_model_dir: Path) -> None:
+    def names(server: Server) -> list[str]:
+        return [item["name"] for item in json.loads(server.ask("GET", "/cameras?limit=100").body)["items"]]
+
+    arguments = ("--seed", "--model", tiny_model_dir)
+    with serving(tmp_path / "data", *arguments) as server:
+        seeded = names(server)
+        assert "nikon-d7500-50mm-f1.8" in seeded
+        assert server.ask("DELETE", f"/cameras/{seeded[0]}").status == 204
+        server.stop(signal.SIGTERM)
+    with serving(tmp_path / "data", *arguments) as server:
+        assert names(server) == seeded[1:]

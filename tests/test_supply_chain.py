@@ -75,6 +75,16 @@ def test_development_has_what_the_service_has() -> None:
     assert not set(pins("service.txt")) & {"torch", "onnx", "pytest"}
 
 
+def test_what_checks_the_page_is_locked_with_hashes() -> None:
+    wanted = json.loads((ROOT / "package.json").read_text())
+    packages: dict[str, dict[str, str]] = json.loads((ROOT / "package-lock.json").read_text())["packages"]
+    ourselves = packages.pop("")
+    assert ourselves["devDependencies"] == wanted["devDependencies"], "run `make lock`"
+    assert {f"node_modules/{name}" for name in wanted["devDependencies"]} <= set(packages)
+    # a host belongs to whoever installs
+    assert all(package["integrity"] and "resolved" not in package for package in packages.values())
+
+
 def test_everything_that_installs_asks_for_hashes() -> None:
     for place in (ROOT / "docker" / "service.Dockerfile", ROOT / "Makefile"):
         installs = [line for line in place.read_text().splitlines() if re.search(r"pip install|PIP\) install", line)]
@@ -82,6 +92,7 @@ def test_everything_that_installs_asks_for_hashes() -> None:
         for line in installs:
             is_hashed = "--require-hashes" in line or ("--no-deps" in line and "--build-constraint" in line)
             assert is_hashed or "torch==" in line, line
+    assert "$(NPM) ci " in (ROOT / "Makefile").read_text()
 
 
 def test_the_bill_of_materials_names_every_pin(tmp_path: Path) -> None:

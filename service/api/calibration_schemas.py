@@ -1,5 +1,6 @@
 """Calibrations on the wire; what they found has the fields of ``service.calibration.report``."""
 
+from dataclasses import asdict
 from datetime import datetime
 from typing import Annotated, Literal, Self
 
@@ -8,12 +9,14 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from service.api.problems import invalid_request
 from service.api.schemas import Given, Name, PinholeIntrinsics
 from service.calibration.edge import Shape
+from service.calibration.look import Exposure, Look
 from service.calibration.report import Method, Role
 from service.calibration.target import CircleGrid, Kind
 from service.errors import BadRequest, FieldProblem
 from service.storage.calibrations import CalibrationRecord, CalibrationSummary
 
 SETTINGS_FIELD = "settings"
+FocalLengthFrom = Literal["camera", "exif"]
 
 Circles = Annotated[int, Field(ge=2, le=40)]
 Millimetres = Annotated[float, Field(gt=0, le=1_000, allow_inf_nan=False)]
@@ -90,6 +93,14 @@ class CalibrationSettings(Given):
             raise _fault("pattern/diameter_mm", f"No such grid can be printed: {exc}.") from exc
 
 
+class Acceptance(Given):
+    """Where an accepted calibration goes."""
+
+    camera: Annotated[
+        Name | None, Field(description="A new camera, or one that gets a revision; null: the calibration's own name")
+    ] = None
+
+
 class ImageRead(BaseModel):
     """What one photograph gave; null where it is not known."""
 
@@ -151,6 +162,41 @@ class ResultRead(BaseModel):
         float | None, Field(description="k_cam in the corners over that in the middle; null where too few circles were")
     ]
     warnings: list[str]
+
+
+class CircleRead(BaseModel):
+    """Where one circle of the grid is in a photograph."""
+
+    u_px: Annotated[float, Field(description="Its centre, before EXIF orientation")]
+    v_px: float
+    radius_px: Annotated[float, Field(description="About; the mean of a tilted circle's two")]
+
+
+class LookRead(BaseModel):
+    """What one photograph of the sheet shows; null where it is not known."""
+
+    found: Annotated[bool, Field(description="Whether the grid was found")]
+    width_px: Annotated[int, Field(description="As the sensor had it, before EXIF orientation")]
+    height_px: int
+    orientation: Annotated[int, Field(ge=1, le=8, description="EXIF's: how a viewer turns the photograph")]
+    circles: Annotated[list[CircleRead], Field(description="All of the grid, row by row")]
+    measured: Annotated[int, Field(description="How many of a dozen circles gave a blur")]
+    blur_px: Annotated[float | None, Field(description="Median blur of its circles, a standard deviation")]
+    distance_m: Annotated[float | None, Field(description="Depth of the grid's middle, along the optical axis")]
+    tilt_deg: Annotated[float | None, Field(description="Between grid and sensor")]
+    focal_length_from: Annotated[
+        FocalLengthFrom | None,
+        Field(description="What distance and tilt rest on; EXIF's is a few percent off"),
+    ]
+    exposure: Annotated[Exposure | None, Field(description="`over`: white is clipped, which sharpens edges")]
+    paper_level: Annotated[float | None, Field(ge=0, le=1, description="How bright the white between the circles is")]
+    warnings: list[str]
+
+    @classmethod
+    def from_look(cls, seen: Look, orientation: int, focal_length_from: FocalLengthFrom | None) -> Self:
+        """What was seen, with how the photograph is to be turned."""
+        more = {"found": seen.found, "orientation": orientation, "focal_length_from": focal_length_from}
+        return cls.model_validate(asdict(seen) | more)
 
 
 class CalibrationItem(BaseModel):

@@ -14,6 +14,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from service.api.calibration_schemas import (
     SETTINGS_FIELD,
+    Acceptance,
     CalibrationItem,
     CalibrationPage,
     CalibrationRead,
@@ -21,7 +22,7 @@ from service.api.calibration_schemas import (
 )
 from service.api.calibration_uploads import DEFOCUSED, FOCUSED, FormLimits, receive_form
 from service.api.cursors import cursor_after, name_of
-from service.api.dependencies import CalibrationsDep, IdempotencyKey, RunnerDep, SettingsDep, SpoolDep
+from service.api.dependencies import CalibrationsDep, IdempotencyKey, RunnerDep, SettingsDep, SpoolDep, require_json
 from service.api.openapi import REF
 from service.api.preferences import MOST_WAIT_S, wait_of
 from service.api.problems import STORE_ERRORS, WRITE_ERRORS, responses
@@ -188,6 +189,21 @@ def plot_calibration(record: FoundDep) -> Response:
     from service.calibration.plot import as_svg  # matplotlib is slow to import, and seldom needed
 
     return Response(as_svg(RESULT.validate_python(record.result)), media_type="image/svg+xml")
+
+
+@router.post(
+    "/calibrations/{id}/accept",
+    operation_id="acceptCalibration",
+    summary="Make a calibration's result a camera",
+    dependencies=[Depends(require_json)],
+    responses=responses(NotFound, Conflict, BadRequest, UnsupportedKind, *WRITE_ERRORS),
+)
+def accept_calibration(record: FoundDep, calibrations: CalibrationsDep, body: Acceptance) -> CalibrationRead:
+    """Store the camera, or a new revision with source `calibration` that keeps the description; once, however often."""
+    if record.result is None:
+        raise Conflict(f"This calibration is {record.state} and has no result: only one that succeeded is accepted.")
+    camera = RESULT.validate_python(record.result).to_camera()
+    return CalibrationRead.from_record(calibrations.accept(record.id, body.camera or record.draft.camera, camera))
 
 
 @router.delete(

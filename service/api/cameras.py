@@ -17,6 +17,8 @@ from service.api.schemas import (
     CameraReplace,
     CurvePoint,
     CurveRead,
+    PreviewRead,
+    RevisionPage,
 )
 from service.api.uploads import REQUEST_BODY, receive_photograph
 from service.errors import (
@@ -42,6 +44,8 @@ BODY_ERRORS = (BadRequest, UnsupportedKind)
 ETAG = {"ETag": {"description": "The revision, for If-Match", "schema": {"type": "string"}}}
 LOCATION = {"Location": {"description": "The camera's path", "schema": {"type": "string"}}}
 CURVE_SPAN = 5.0
+CURVE_POINTS = 101
+REVISION_PATTERN = r"[1-9][0-9]{0,8}"
 
 router = APIRouter(prefix="/cameras", tags=["cameras"])
 
@@ -104,6 +108,20 @@ async def draft_camera_from_photo(request: Request, settings: SettingsDep) -> Ca
     return CameraDraftRead.model_validate(await run_in_threadpool(_drafted, upload.data), from_attributes=True)
 
 
+@router.post(
+    "/preview",
+    operation_id="previewCamera",
+    summary="See what a camera's numbers come to",
+    dependencies=[Depends(require_json)],
+    responses=responses(*BODY_ERRORS),
+)
+def preview_camera(body: CameraReplace) -> PreviewRead:
+    """k_cam, range and blur curve of a camera as `POST /cameras` takes it, name or not; nothing is stored."""
+    draft = body.to_draft("preview")
+    focus_m = draft.camera.focus_distance_m
+    return PreviewRead.from_draft(draft, _curve(draft.camera, focus_m / CURVE_SPAN, focus_m * CURVE_SPAN, CURVE_POINTS))
+
+
 @router.get(
     "/{name}",
     operation_id="readCamera",
@@ -146,6 +164,27 @@ def delete_camera(name: str, cameras: CamerasDep, if_match: IfMatch = None) -> N
 
 
 @router.get(
+    "/{name}/revisions",
+    operation_id="listCameraRevisions",
+    summary="List a camera's revisions, the newest first",
+    responses=responses(NotFound, BadRequest, *STORE_ERRORS),
+)
+def list_revisions(
+    name: str,
+    cameras: CamerasDep,
+    limit: Annotated[int, Query(ge=1, le=200)] = 50,
+    cursor: Annotated[str | None, Query(max_length=200, description="`next_cursor` of the page before")] = None,
+) -> RevisionPage:
+    """What the camera was at every revision, those of a deleted camera of this name among them."""
+    before = name_of(cursor, REVISION_PATTERN)
+    records, has_more = cameras.revisions(name, limit, int(before) if before else None)
+    return RevisionPage(
+        items=[CameraRead.from_record(record) for record in records],
+        next_cursor=cursor_after(records[-1].revision) if has_more else None,
+    )
+
+
+@router.get(
     "/{name}/curve",
     operation_id="readCameraCurve",
     summary="Blur against distance",
@@ -156,7 +195,7 @@ def read_curve(
     cameras: CamerasDep,
     near_m: Depth = None,
     far_m: Depth = None,
-    points: Annotated[int, Query(ge=2, le=2_000, description="Evenly spaced in distance")] = 101,
+    points: Annotated[int, Query(ge=2, le=2_000, description="Evenly spaced in distance")] = CURVE_POINTS,
 ) -> CurveRead:
     """The blur the camera shows by distance, by default from a fifth to five times its focus distance."""
     record = cameras.get(name)
@@ -166,12 +205,11 @@ def read_curve(
     if near >= far:
         detail = "near_m must be smaller than far_m."
         raise BadRequest(detail, errors=(FieldProblem("near_m", detail), FieldProblem("far_m", detail)))
-    depths = [near + (far - near) * step / (points - 1) for step in range(points)]
     return CurveRead(
         camera=record.name,
         revision=record.revision,
         focus_distance_m=focus_m,
-        points=[_curve_point(record.camera, depth_m) for depth_m in depths],
+        points=_curve(record.camera, near, far, points),
     )
 
 
@@ -190,6 +228,11 @@ def _revisions(if_match: str | None) -> list[int] | None:
     if if_match is None or if_match.strip() == "*":
         return None
     return [int(number) for number in re.findall(r'(?<!W/)"(\d{1,9})"', if_match)]
+
+
+def _curve(camera: Camera, near_m: float, far_m: float, points: int) -> list[CurvePoint]:
+    depths = [near_m + (far_m - near_m) * step / (points - 1) for step in range(points)]
+    return [_curve_point(camera, depth_m) for depth_m in depths]
 
 
 def _curve_point(camera: Camera, depth_m: float) -> CurvePoint:

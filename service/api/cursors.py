@@ -9,8 +9,8 @@ from service.storage.cameras import NAME_PATTERN
 PREFIX = "after:"
 
 
-def cursor_after(name: str) -> str:
-    """A cursor for what comes behind the name."""
+def cursor_after(name: str | int) -> str:
+    """A cursor for what comes behind the name, or the number."""
     return urlsafe_b64encode(f"{PREFIX}{name}".encode()).decode().rstrip("=")
 
 

@@ -1,14 +1,13 @@
 """``POST /depth``: one photograph in, metres out."""
 
-import asyncio
-from collections.abc import Awaitable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, TypeVar
+from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
-from starlette.requests import ClientDisconnect
 
+from service.api.clients import unless_gone
 from service.api.dependencies import CamerasDep, EstimatorDep, SettingsDep, WorkerDep
 from service.api.depth_schemas import DepthQuery, DepthRead, PointRead, SpreadRead
 from service.api.negotiation import choose_format
@@ -36,8 +35,6 @@ from service.inference.part import Part
 from service.optics.camera import Camera
 from service.storage.cameras import CameraRecord
 from service.tracing import STAGES_KEY
-
-T = TypeVar("T")
 
 JSON = "json"
 FORMAT_TYPES = {**MEDIA_TYPES, JSON: "application/json"}
@@ -122,12 +119,10 @@ async def estimate_depth(
     chosen = choose_format(query.format, request.headers.get("accept"), FORMAT_TYPES)
     upload = await receive_photograph(request, settings.max_image_bytes)
     record = await run_in_threadpool(cameras.get, query.camera)
-    camera, warnings = _focused(_with_focal_length(record), query.focus_distance_m)
+    camera, warnings = _focused(record.with_focal_length, query.focus_distance_m)
     limits = ImageLimits.of(settings)
     order = Order(upload, record, camera, query, chosen, limits, warnings)
-    outcome = await _unless_gone(request, worker.run(fulfil, order, estimator))
-    if outcome is None:
-        raise ClientDisconnect
+    outcome = await unless_gone(request, worker.run(fulfil, order, estimator))
     answer = outcome.value
     timings_ms = {**answer.timings_ms, "wait": outcome.wait_ms}
     request.app.state.metrics.time_stages(timings_ms)
@@ -183,12 +178,6 @@ def _encode_json(depth_map: DepthMap, order: Order, part: Part, model: str, warn
     return Encoded(read.model_dump_json().encode(), FORMAT_TYPES[JSON])
 
 
-def _with_focal_length(record: CameraRecord) -> Camera:
-    """The camera with intrinsics where its lens tells them, the principal point in the middle."""
-    camera, lens = record.camera, record.draft.lens
-    return camera.seen_through(lens) if lens and camera.intrinsics is None else camera
-
-
 def _focused(camera: Camera, focus_distance_m: float | None) -> tuple[Camera, tuple[str, ...]]:
     """The camera at this shot's focus distance, with a warning where that is not exact."""
     if focus_distance_m is None or focus_distance_m == camera.focus_distance_m:
@@ -201,23 +190,6 @@ def _focused(camera: Camera, focus_distance_m: float | None) -> tuple[Camera, tu
     if camera.focal_length_m is None:
         return focused, ("The lens' focal length is unknown and was taken as far below the focus distance.",)
     return focused, ()
-
-
-async def _unless_gone(request: Request, work: Awaitable[T]) -> T | None:
-    """The work's result; None where the client went away, which cancels the work."""
-    running = asyncio.ensure_future(work)
-    gone = asyncio.ensure_future(_disconnected(request))
-    try:
-        await asyncio.wait({running, gone}, return_when=asyncio.FIRST_COMPLETED)
-        return running.result() if running.done() else None
-    finally:
-        running.cancel()
-        gone.cancel()
-
-
-async def _disconnected(request: Request) -> None:
-    while (await request.receive())["type"] != "http.disconnect":
-        pass
 
 
 def _header_safe(text: str) -> str:

@@ -1,13 +1,13 @@
 """Cameras on the wire. Unknown fields, strings for numbers, NaN and infinity are refused."""
 
 from datetime import datetime
-from typing import Annotated, Literal, Self
+from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from service.errors import BadRequest, FieldProblem
 from service.optics.camera import Camera, Intrinsics, Lens
-from service.storage.cameras import DEFAULT_K_R, NAME_PATTERN, CameraDraft, CameraRecord
+from service.storage.cameras import DEFAULT_K_R, NAME_PATTERN, CameraDraft, CameraRecord, Source
 
 DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 PLAIN_TEXT = r"^[^\x00-\x08\x0b\x0c\x0e-\x1f\x7f]*$"
@@ -209,7 +209,7 @@ class RangeRead(BaseModel):
 
 
 class CameraRead(BaseModel):
-    """A stored camera at its current revision."""
+    """A stored camera at one revision."""
 
     name: Name
     description: str | None
@@ -222,7 +222,7 @@ class CameraRead(BaseModel):
         float,
         Field(description="Diameter of the circle of confusion over its standard deviation, behind k_cam"),
     ]
-    source: Annotated[Literal["given", "lens", "calibration"], Field(description="Where k_cam came from")]
+    source: Annotated[Source, Field(description="Where k_cam came from")]
     lens: LensSpecs | None
     intrinsics: PinholeIntrinsics | None
     fx_px: Annotated[float | None, Field(description="From the intrinsics or the lens, else null")]
@@ -263,6 +263,13 @@ class CameraPage(BaseModel):
     next_cursor: Annotated[str | None, Field(description="Pass it as `cursor` for the next page; null: the last")]
 
 
+class RevisionPage(BaseModel):
+    """A camera's revisions, the newest first; the times of each are those when it was written."""
+
+    items: list[CameraRead]
+    next_cursor: Annotated[str | None, Field(description="Pass it as `cursor` for the next page; null: the last")]
+
+
 class CurvePoint(BaseModel):
     """What the camera shows of a point at one distance."""
 
@@ -270,6 +277,35 @@ class CurvePoint(BaseModel):
     blur_px: Annotated[float, Field(description="Standard deviation of the blur in the image")]
     defocus_px: Annotated[float, Field(description="The part of it that comes from defocus")]
     depth_error_m: Annotated[float, Field(description="How far 0.25 px of blur error moves the depth")]
+
+
+class PreviewRead(BaseModel):
+    """What follows from a camera's numbers; nothing of it is stored."""
+
+    focus_distance_m: float
+    k_cam_px: float
+    gamma_px: float
+    k_r: float
+    source: Source
+    fx_px: Annotated[float | None, Field(description="From the intrinsics or the lens, else null")]
+    range_m: RangeRead
+    points: Annotated[list[CurvePoint], Field(description="Blur from a fifth to five times the focus distance")]
+
+    @classmethod
+    def from_draft(cls, draft: CameraDraft, points: list[CurvePoint]) -> Self:
+        """The camera of a draft, with what follows from it."""
+        camera = draft.camera
+        near, far = camera.range_m
+        return cls(
+            focus_distance_m=camera.focus_distance_m,
+            k_cam_px=camera.k_cam_px,
+            gamma_px=camera.gamma_px,
+            k_r=draft.k_r,
+            source=draft.source,
+            fx_px=_fx_px(draft),
+            range_m=RangeRead(near=near, far=far),
+            points=points,
+        )
 
 
 class CurveRead(BaseModel):

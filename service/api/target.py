@@ -16,18 +16,28 @@ Circles = Annotated[int, Query(ge=2, le=MOST_CIRCLES)]
 Millimetres = Annotated[float, Query(gt=0, le=1000, allow_inf_nan=False)]
 
 
-def _sheet(
+def grid_of_query(
     kind: Annotated[Kind, Query(description="How the circles stand")] = "asymmetric_circles",
     rows: Circles = 11,
     columns: Circles = 4,
     spacing_mm: Millimetres = 20.0,
     diameter_mm: Millimetres = 12.0,
-    paper: Annotated[Paper, Query(description="The sheet")] = "a4",
-) -> Sheet:
+) -> CircleGrid:
+    """The grid that the query names. Raises ``BadRequest`` for circles that touch."""
     try:
-        return lay_out(CircleGrid(kind, rows, columns, spacing_mm, diameter_mm), paper)
+        return CircleGrid(kind, rows, columns, spacing_mm, diameter_mm)
     except ValueError as exc:
-        raise BadRequest(str(exc), errors=(FieldProblem("spacing_mm", str(exc)),)) from exc
+        raise _misfit(exc) from exc
+
+
+GridDep = Annotated[CircleGrid, Depends(grid_of_query)]
+
+
+def _sheet(grid: GridDep, paper: Annotated[Paper, Query(description="The sheet")] = "a4") -> Sheet:
+    try:
+        return lay_out(grid, paper)
+    except ValueError as exc:
+        raise _misfit(exc) from exc
 
 
 SheetDep = Annotated[Sheet, Depends(_sheet)]
@@ -55,3 +65,7 @@ def read_target_svg(sheet: SheetDep) -> Response:
 def read_target_pdf(sheet: SheetDep) -> Response:
     """A grid of circles in true millimetres, with a ruler to check the print."""
     return Response(as_pdf(sheet), media_type="application/pdf")
+
+
+def _misfit(cause: ValueError) -> BadRequest:
+    return BadRequest(str(cause), errors=(FieldProblem("spacing_mm", str(cause)),))

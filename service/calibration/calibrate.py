@@ -4,34 +4,27 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.calibration import fit
-from service.calibration.edge import EdgeError, EdgeFit, find_spread, fit_again, fit_edge, slice_blur
-from service.calibration.grid import FoundGrid, GridError, find_grid
-from service.calibration.pose import Placement, PoseError, View, place
+from service.calibration.edge import find_spread, fit_again
+from service.calibration.measure import LEAST_CIRCLES, Measured, measure
+from service.calibration.pose import Placement, PoseError, place
 from service.calibration.report import Method, PictureReport, Report, Result, Role, Sample
 from service.calibration.target import CircleGrid
 from service.errors import CamindError
-from service.opencv import cv2
-from service.optics.light import decode_srgb
 
 Array = NDArray[np.float64]
 Tell = Callable[[float, tuple[PictureReport, ...]], None]
 
 TELL_EVERY_S = 1.0
 FITTING_PART = 0.2  # of the progress
-CLIPPED_LEVEL = 252
-CLIPPED_PART = 0.5
-PAPER_FROM_RADII, PAPER_TO_RADII = 1.3, 1.6
-LUMINANCE = (0.2126, 0.7152, 0.0722)
 BAD_VIEW = 4.0
 LEAST_BAD_PX = 1.5
-LEAST_CIRCLES = 8
 CENTRE_TO, CORNER_FROM = 0.4, 0.7
 FIELD_DIFFERENCE = 0.1
 LEAST_FIELD_CIRCLES = 12
@@ -56,28 +49,6 @@ class Task:
     grid: CircleGrid
     focus_distance_m: float | None = None
     method: Method = "edge"
-
-
-@dataclass(slots=True)
-class _Measured:
-    """What one picture gave: its circles by number, where they are, and how blurred."""
-
-    report: PictureReport
-    size_px: tuple[int, int] = (0, 0)
-    grid: FoundGrid | None = None
-    circles: list[int] = field(default_factory=list)
-    centres_px: list[tuple[float, float]] = field(default_factory=list)
-    edges: list[EdgeFit] = field(default_factory=list)
-    slices_px: list[float] = field(default_factory=list)  # lambda as the paper reads it, if asked for
-
-    def view(self) -> View:
-        return View(np.array(self.circles, np.int64), np.array(self.centres_px, np.float64))
-
-    def blur_px(self) -> list[float]:
-        return self.slices_px or [edge.blur_px for edge in self.edges]
-
-    def warn(self, words: str) -> None:
-        self.report = replace(self.report, warnings=(*self.report.warnings, words))
 
 
 class _Teller:
@@ -109,7 +80,7 @@ def calibrate(
     pictures is in the report, never raised.
     """
     teller = _Teller(tell, check)
-    measured: list[_Measured] = []
+    measured: list[Measured] = []
     with threadpool_limits(1, "blas"):  # the sums are small: more threads would wait for each other
         for number, picture in enumerate(pictures):
 
@@ -127,7 +98,7 @@ def calibrate(
     return Report(tuple(one.report for one in measured), result, None)
 
 
-def _partner(picture: Picture, measured: list[_Measured]) -> _Measured | None:
+def _partner(picture: Picture, measured: list[Measured]) -> Measured | None:
     """The focused picture that this defocused one is the pair of, if it came before: each kind is counted alone."""
     if picture.role == "focused":
         return None
@@ -136,85 +107,18 @@ def _partner(picture: Picture, measured: list[_Measured]) -> _Measured | None:
     return focused[place_] if place_ < len(focused) else None
 
 
-def _measured(task: Task, picture: Picture, at: Callable[[float], None], partner: _Measured | None = None) -> _Measured:
-    out = _Measured(PictureReport(picture.name, picture.role, found=False))
+def _measured(task: Task, picture: Picture, at: Callable[[float], None], partner: Measured | None = None) -> Measured:
+    out = Measured(PictureReport(picture.name, picture.role, found=False))
     try:
         rgb = picture.load()
     except CamindError as error:
         out.warn(error.detail)
         return out
-    out.size_px = (rgb.shape[1], rgb.shape[0])
-    grey = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
-    at(0.05)
-    try:
-        out.grid = find_grid(grey, task.grid)
-    except GridError as error:
-        out.warn(str(error))
-        if partner is None or partner.grid is None or partner.size_px != out.size_px:
-            return out
-        out.grid = partner.grid
-        out.warn("looked for the circles where its focused partner has them")
-    else:
-        out.report = replace(out.report, found=True)
-    at(0.1)
-    _measure_circles(task, rgb, out.grid, out, at)
-    out.report = replace(
-        out.report,
-        found=out.report.found or bool(out.circles),
-        circles=len(out.circles),
-        blur_px=float(np.median(out.blur_px())) if out.edges else None,
-    )
+    measure(out, rgb, task.grid, at, method=task.method, partner=partner)
     return out
 
 
-def _measure_circles(
-    task: Task, rgb: NDArray[np.uint8], grid: FoundGrid, out: _Measured, at: Callable[[float], None]
-) -> None:
-    reasons: Counter[str] = Counter()
-    like: EdgeFit | None = None
-    left, top, light, peak = _light_about(rgb, grid)
-    for number, ((x, y), radius) in enumerate(zip(grid.centres_px.tolist(), grid.radii_px.tolist(), strict=True)):
-        at(0.1 + 0.9 * number / len(grid.radii_px))
-        try:
-            if _is_clipped(peak, x - left, y - top, radius):
-                raise EdgeError("the paper around it is overexposed: expose so that white stays grey")
-            edge = fit_edge(light, x - left, y - top, radius, like)
-            if task.method == "paper":
-                out.slices_px.append(slice_blur(light, edge.x_px, edge.y_px, edge.radius_px))
-        except EdgeError as error:
-            reasons[str(error)] += 1
-            continue
-        like = edge
-        out.circles.append(number)
-        out.centres_px.append((edge.x_px + left, edge.y_px + top))
-        out.edges.append(edge)
-    for reason, count in reasons.most_common(3):
-        out.warn(f"{count} of {len(grid.radii_px)} circles not measured: {reason}")
-    if 0 < len(out.circles) < LEAST_CIRCLES:
-        out.warn(f"left out: {len(out.circles)} circles do not place the sheet, {LEAST_CIRCLES} are needed")
-
-
-def _light_about(rgb: NDArray[np.uint8], grid: FoundGrid) -> tuple[int, int, NDArray[np.float32], NDArray[np.uint8]]:
-    """The part of the picture with the grid: its corner (x, y), luminance in linear light, the brightest channel."""
-    reach = 3 * grid.radii_px[:, None]
-    low = np.maximum(np.floor((grid.centres_px - reach).min(0)).astype(int), 0)
-    high = np.ceil((grid.centres_px + reach).max(0)).astype(int) + 1
-    part = rgb[low[1] : high[1], low[0] : high[0]]
-    curve = decode_srgb(np.arange(256, dtype=np.float32) / np.float32(255))
-    weighted = [weight * curve[part[..., i]] for i, weight in enumerate(LUMINANCE)]
-    return int(low[0]), int(low[1]), np.asarray(sum(weighted), np.float32), part.max(axis=2)
-
-
-def _is_clipped(peak: NDArray[np.uint8], x: float, y: float, radius: float) -> bool:
-    angle = np.linspace(0, 2 * np.pi, 32, endpoint=False)
-    ring = np.concatenate([np.stack([np.cos(angle), np.sin(angle)], 1) * r for r in (PAPER_FROM_RADII, PAPER_TO_RADII)])
-    places = np.rint(ring * radius + (x, y)).astype(int)
-    inside = (places >= 0).all(1) & (places < peak.shape[::-1]).all(1)
-    levels = peak[places[inside, 1], places[inside, 0]]
-    return levels.size > 0 and float((levels >= CLIPPED_LEVEL).mean()) > CLIPPED_PART
-
-
-def _fitted(task: Task, measured: list[_Measured], at: Callable[[float], None]) -> Result:
+def _fitted(task: Task, measured: list[Measured], at: Callable[[float], None]) -> Result:
     size_px, usable = _of_one_size(measured)
     placement, usable = _placed(task.grid, usable, size_px)
     for one, distance, tilt in zip(usable, placement.distance_m, placement.tilt_deg, strict=True):
@@ -269,7 +173,7 @@ def _constants(
     return fit.fit_as_paper(circles, task.focus_distance_m, depth_error=error, resamples=resamples)
 
 
-def _of_one_size(measured: list[_Measured]) -> tuple[tuple[int, int], list[_Measured]]:
+def _of_one_size(measured: list[Measured]) -> tuple[tuple[int, int], list[Measured]]:
     """Most pictures' size and those that have it, upright ones among them turned to lie as the others do."""
     with_circles = [one for one in measured if len(one.circles) >= LEAST_CIRCLES]
     if not with_circles:
@@ -287,7 +191,7 @@ def _of_one_size(measured: list[_Measured]) -> tuple[tuple[int, int], list[_Meas
     return size_px, usable
 
 
-def _placed(grid: CircleGrid, measured: list[_Measured], size_px: tuple[int, int]) -> tuple[Placement, list[_Measured]]:
+def _placed(grid: CircleGrid, measured: list[Measured], size_px: tuple[int, int]) -> tuple[Placement, list[Measured]]:
     """The placement without pictures that fit it far worse than the others, which are told so."""
     placement = place(grid, [one.view() for one in measured], size_px)
     limit = max(BAD_VIEW * float(np.median(placement.rms_px)), LEAST_BAD_PX)
@@ -300,7 +204,7 @@ def _placed(grid: CircleGrid, measured: list[_Measured], size_px: tuple[int, int
     return place(grid, [one.view() for one in kept], size_px), kept
 
 
-def _circles(measured: list[_Measured], placement: Placement) -> fit.Circles:
+def _circles(measured: list[Measured], placement: Placement) -> fit.Circles:
     counts = [len(one.circles) for one in measured]
     return fit.Circles(
         np.concatenate(placement.depth_m),
@@ -311,7 +215,7 @@ def _circles(measured: list[_Measured], placement: Placement) -> fit.Circles:
     )
 
 
-def _samples(measured: list[_Measured], circles: fit.Circles, constants: fit.Constants) -> Iterator[Sample]:
+def _samples(measured: list[Measured], circles: fit.Circles, constants: fit.Constants) -> Iterator[Sample]:
     k_cam = fit.per_circle_k_cam(circles, constants.gamma_px.value, constants.focus_distance_m.value)
     index = 0
     for one in measured:
@@ -330,7 +234,7 @@ def _samples(measured: list[_Measured], circles: fit.Circles, constants: fit.Con
             index += 1
 
 
-def _left_out(measured: list[_Measured], usable: list[_Measured]) -> Iterator[str]:
+def _left_out(measured: list[Measured], usable: list[Measured]) -> Iterator[str]:
     if len(usable) < len(measured):
         yield f"{len(measured) - len(usable)} of {len(measured)} photographs were of no use: see what each of them says"
 

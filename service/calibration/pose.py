@@ -77,7 +77,7 @@ def place(grid: CircleGrid, views: Sequence[View], size_px: tuple[int, int]) -> 
         for view, turn, shift in zip(views, turns, solved.shifts, strict=True)
     ]
     middle = board.mean(0)
-    tilts = [float(np.degrees(np.arccos(min(abs(turn[2, 2]), 1.0)))) for turn in turns]
+    tilts = [_tilt_deg(turn) for turn in turns]
     matrix = solved.matrix
     return Placement(
         Intrinsics(
@@ -95,6 +95,31 @@ def place(grid: CircleGrid, views: Sequence[View], size_px: tuple[int, int]) -> 
         solved.focal_error,
         (*_warnings(grid, views, solved, tilts), *_imperfect(bent_mm)),
     )
+
+
+def stand(grid: CircleGrid, view: View, intrinsics: Intrinsics) -> tuple[float, float] | tuple[None, None]:
+    """How far (m, along the axis) the middle of the sheet stands from a camera that is known, and its tilt in degrees.
+
+    Neither where no pose fits the circles.
+    """
+    flat = np.column_stack([grid.points_mm(), np.zeros(grid.rows * grid.columns)])
+    matrix = np.array([[intrinsics.fx_px, 0, intrinsics.cx_px], [0, intrinsics.fy_px, intrinsics.cy_px], [0, 0, 1]])
+    distortion = np.array(intrinsics.distortion, np.float64)
+    try:
+        is_placed, turn, shift = cv2.solvePnP(
+            flat[view.circles], np.asarray(view.centres_px, np.float64)[:, None], matrix, distortion
+        )
+    except cv2.error:
+        return None, None
+    if not is_placed:
+        return None, None
+    rotation = np.asarray(cv2.Rodrigues(turn)[0], np.float64)
+    middle = rotation @ flat.mean(0) + np.asarray(shift, np.float64).ravel()
+    return float(middle[2]) / 1e3, _tilt_deg(rotation)
+
+
+def _tilt_deg(rotation: NDArray[np.generic]) -> float:
+    return float(np.degrees(np.arccos(min(abs(rotation[2, 2]), 1.0))))
 
 
 @dataclass(frozen=True, slots=True)

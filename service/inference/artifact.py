@@ -141,7 +141,8 @@ class Manifest(_Part):
     """What ``manifest.json`` says.
 
     ``multiple``: height and width of the image given to the blur graph are multiples of it.
-    ``stride``: pixels of the image per pixel of the maps, along each axis.
+    ``stride``: pixels of the image per pixel of the maps, along each axis. ``temperature``: what stated errors of depth
+    are multiplied with, so that they hold what they promise for cameras that were not trained on.
     """
 
     schema_version: Literal[1] = SCHEMA_VERSION
@@ -150,6 +151,7 @@ class Manifest(_Part):
     created_at: AwareDatetime
     multiple: Annotated[int, Field(ge=1, le=256)]
     stride: Annotated[int, Field(ge=1, le=16)]
+    temperature: Annotated[float, Field(gt=0, le=10)] = 1.0
     graphs: Graphs
     ranges: Ranges
     scores: dict[str, float]

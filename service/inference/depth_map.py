@@ -7,6 +7,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from service.inference.artifact import Manifest
 from service.inference.pair import RawMaps, Side
 from service.inference.part import Part
 from service.inference.resampling import Ratio, sample
@@ -14,6 +15,7 @@ from service.optics import thin_lens
 from service.optics.camera import Camera
 
 MAX_RELATIVE_ERROR = 1.0
+LEAST_BLUR_ERROR_PX = 0.05  # nobody reads blur better: no stated error is below what it does to depth
 SIGMA_OF_LAPLACE = np.float32(2**0.5)
 
 Array = NDArray[np.float32]
@@ -74,7 +76,7 @@ class Reading:
     ratio: Ratio
 
     @classmethod
-    def of(cls, maps: RawMaps, camera: Camera, photograph_size: tuple[int, int], stride: int) -> Self:
+    def of(cls, maps: RawMaps, camera: Camera, photograph_size: tuple[int, int], manifest: Manifest) -> Self:
         """``photograph_size`` is (height, width)."""
         x = thin_lens.relative_defocus_from_blur(maps["blur_px"], camera.gamma_px, camera.k_cam_px)
         focus_m = np.float32(camera.focus_distance_m)
@@ -84,8 +86,8 @@ class Reading:
             camera.image_width_px / photograph_size[1],
             np.exp(maps["log_ratio_near"]) * focus_m,
             np.where(x < 1, np.exp(maps["log_ratio_far"]) * focus_m, np.float32(np.nan)),
-            np.exp(maps["log_scale"]) * SIGMA_OF_LAPLACE,
-            Ratio.between(photograph_size, (camera.image_height_px, camera.image_width_px), stride),
+            np.exp(maps["log_scale"]) * (SIGMA_OF_LAPLACE * np.float32(manifest.temperature)),
+            Ratio.between(photograph_size, (camera.image_height_px, camera.image_width_px), manifest.stride),
         )
 
 
@@ -126,7 +128,8 @@ def decide(readings: list[Reading], size: tuple[int, int], side: Side) -> tuple[
 def _told(reading: Reading, size: tuple[int, int], side: Side) -> Layers:
     """Layers from one reading, whose ``sigma_m`` is relative yet.
 
-    The side is what the network tells unless it is given; where no far answer can exist it is near, always.
+    The side is what the network tells unless it is given; where no far answer can exist it is near, always. No error
+    is stated below the floor of optics.
     """
     near_m, far_m, error, p_near, blur_px = (
         sample(values, reading.ratio, size)
@@ -139,5 +142,8 @@ def _told(reading: Reading, size: tuple[int, int], side: Side) -> Layers:
     depth_m = np.where(is_near, near_m, far_m)
     other_m = near_m
     np.copyto(other_m, far_m, where=is_near)
+    camera = reading.camera
+    floor = thin_lens.depth_error(1.0, camera.focus_distance_m, camera.k_cam_px, LEAST_BLUR_ERROR_PX)
+    np.fmax(error, np.float32(floor) * depth_m, out=error)
     blur_px /= np.float32(reading.scale)
     return Layers(depth_m, other_m, p_near, error, blur_px)

@@ -121,7 +121,7 @@ class Estimator:
             stride=self.manifest.stride,
             pixel_budget=self._pixel_budget,
         )
-        return Reading.of(maps, working, rgb.shape[:2], self.manifest.stride)
+        return Reading.of(maps, working, rgb.shape[:2], self.manifest)
 
     def _warnings(self, readings: list[Reading]) -> list[str]:
         first, last, ranges = readings[0], readings[-1], self.manifest.ranges

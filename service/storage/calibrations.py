@@ -1,7 +1,8 @@
 """Calibrations in the database: a queue, what each has come to, and the only doors from one state to the next.
 
 ``queued -> running -> succeeded | failed | cancelled``; running goes back to queued where the service stops, and what
-has ended never changes again. Each belongs to the spool, the folder of photographs, of one data folder.
+has ended never changes again, but for the camera that it is accepted into. Each belongs to the spool, the folder of
+photographs, of one data folder.
 """
 
 import re
@@ -15,7 +16,7 @@ from sqlalchemy import Engine, func, update
 from sqlalchemy.exc import IntegrityError
 from sqlmodel import Session, col, select
 
-from service.errors import NotFound
+from service.errors import Conflict, NotFound
 from service.optics.camera import Camera
 from service.principal import LOCAL
 from service.storage.cameras import store_calibrated
@@ -219,6 +220,17 @@ class Calibrations:
             # another process made the camera's name between the look and the insert: now it is there to revise
             return self._finish(calibration_id, ending)
 
+    def accept(self, calibration_id: str, name: str, camera: Camera) -> CalibrationRecord:
+        """Store what a calibration found as a camera, new or at a new revision, once: again, it is as it was.
+
+        Raises ``NotFound``, ``Conflict`` where it was accepted under another name.
+        """
+        try:
+            return self._accept(calibration_id, name, camera)
+        except IntegrityError:
+            # another process made the camera's name between the look and the insert: now it is there to revise
+            return self._accept(calibration_id, name, camera)
+
     def cancel(self, calibration_id: str) -> State:
         """Cancel what has not ended; the state before. Raises ``NotFound``."""
         with writing(self._engine) as session:
@@ -294,6 +306,17 @@ class Calibrations:
             row.progress = 1.0 if ending.state == "succeeded" else row.progress
             _changed(session, row)
             return True
+
+    def _accept(self, calibration_id: str, name: str, camera: Camera) -> CalibrationRecord:
+        with writing(self._engine) as session:
+            row = _require_row(session, calibration_id, self._owner, lock=True)
+            if row.camera_revision is None:
+                row.camera_revision = store_calibrated(session, row.owner, name, camera).revision
+                row.camera = name
+                return _changed(session, row)
+            if row.camera != name:
+                raise Conflict(f"It is accepted already, as revision {row.camera_revision} of camera '{row.camera}'.")
+            return _to_record(row)
 
 
 def _require_row(session: Session, calibration_id: str, owner: str | None, *, lock: bool = False) -> CalibrationRow:

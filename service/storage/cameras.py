@@ -61,6 +61,12 @@ class CameraRecord:
     def camera(self) -> Camera:
         return self.draft.camera
 
+    @property
+    def with_focal_length(self) -> Camera:
+        """The camera with intrinsics where its lens tells them, the principal point in the middle."""
+        camera, lens = self.camera, self.draft.lens
+        return camera.seen_through(lens) if lens and camera.intrinsics is None else camera
+
 
 class Cameras:
     """An owner's cameras in one database; safe to share between threads. Another owner's are as if not there."""
@@ -102,6 +108,20 @@ class Cameras:
             query = query.where(col(CameraRow.name) > after)
         with reading(self._engine) as session:
             records = [_to_record(row, revision) for row, revision in session.exec(query)]
+        return records[:limit], len(records) > limit
+
+    def revisions(self, name: str, limit: int, before: int | None = None) -> tuple[list[CameraRecord], bool]:
+        """Up to ``limit`` revisions, the newest first, from the one before ``before``; and whether there are more.
+
+        Those of a deleted camera that had the name are among them. Raises ``NotFound``.
+        """
+        with reading(self._engine) as session:
+            row = _live(_find_row(session, self._owner, name), name)
+            query = select(CameraRevisionRow).where(col(CameraRevisionRow.camera_id) == row.id)
+            if before is not None:
+                query = query.where(col(CameraRevisionRow.revision) < before)
+            found = session.exec(query.order_by(col(CameraRevisionRow.revision).desc()).limit(limit + 1))
+            records = [_to_past(row, revision) for revision in found]
         return records[:limit], len(records) > limit
 
     def replace(self, draft: CameraDraft, expected: Sequence[int] | None = None) -> CameraRecord:
@@ -203,8 +223,7 @@ def _as_added(session: Session, owner: str, name: str, number: int) -> CameraRec
     row = _find_row(session, owner, name)
     if row is None:
         raise RuntimeError("a camera that was added has no row")
-    revision = _revision(session, row, number)
-    return CameraRecord(_to_record(row, revision).draft, number, revision.created_at, revision.created_at)
+    return _to_past(row, _revision(session, row, number))
 
 
 def _write_revision(session: Session, row: CameraRow, draft: CameraDraft, now: datetime) -> CameraRecord:
@@ -259,6 +278,11 @@ def _to_record(row: CameraRow, revision: CameraRevisionRow) -> CameraRecord:
     )
     draft = CameraDraft(row.name, camera, _to_source(revision.source), lens, revision.description)
     return CameraRecord(draft, revision.revision, row.created_at, row.updated_at)
+
+
+def _to_past(row: CameraRow, revision: CameraRevisionRow) -> CameraRecord:
+    """A camera as it was at a revision, with the time that was written."""
+    return CameraRecord(_to_record(row, revision).draft, revision.revision, revision.created_at, revision.created_at)
 
 
 def _to_lens(row: CameraRevisionRow) -> Lens | None:

@@ -483,3 +483,34 @@ def test_photographs_of_a_sheet_become_a_camera_that_depth_can_use(settings: Set
         assert camera["focus_distance_m"] == pytest.approx(CAMERA.focus_distance_m, rel=0.02)
         plot = client.get(f"/calibrations/{found['id']}/plot.svg")
         assert (plot.status_code, plot.headers["content-type"]) == (200, "image/svg+xml")
+
+
+def test_what_was_not_registered_is_accepted_later(client: TestClient) -> None:
+    path = send(client, prefer="wait=20").headers["location"]
+    assert client.get("/cameras").json()["items"] == []
+    accepted = client.post(f"{path}/accept", json={})
+    assert accepted.status_code == 200
+    assert (accepted.json()["camera"], accepted.json()["camera_revision"]) == ("bench", 1)
+    camera = client.get("/cameras/bench").json()
+    assert (camera["source"], camera["k_cam_px"], camera["focus_distance_m"]) == ("calibration", 6.5, 1.5)
+    assert camera["intrinsics"] == {**asdict(RESULT.intrinsics), "distortion": [0.125, -0.25, 0.0, 0.0, 0.5]}
+    # an answer that was lost is asked for again
+    assert client.post(f"{path}/accept", json={"camera": "bench"}).json() == accepted.json()
+    assert client.get("/cameras/bench").json()["revision"] == 1
+
+
+def test_a_calibration_is_accepted_into_another_camera(client: TestClient, phone: dict[str, Any]) -> None:
+    client.post("/cameras", json=phone | {"description": "kept"})
+    path = send(client, prefer="wait=20").headers["location"]
+    accepted = client.post(f"{path}/accept", json={"camera": "pixel7-wide"}).json()
+    assert (accepted["camera"], accepted["camera_revision"]) == ("pixel7-wide", 2)
+    assert client.get("/cameras/pixel7-wide").json()["description"] == "kept"
+    refused(client.post(f"{path}/accept", json={"camera": "bench"}), 409, None, "pixel7-wide")
+
+
+def test_what_has_no_result_is_not_accepted(client: TestClient, fake: FakeCalibration) -> None:
+    fake.go.clear()
+    path = send(client).headers["location"]
+    refused(client.post(f"{path}/accept", json={}), 409, None, "no result")
+    refused(client.post(f"{path}/accept", json={"camera": "no name"}), 422, "#/camera")
+    refused(client.post(f"/calibrations/{'0' * 32}/accept", json={}), 404)

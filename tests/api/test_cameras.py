@@ -316,3 +316,55 @@ def _json_with(fields: dict[str, Any], name: str, raw: str) -> str:
     """JSON text with one value written as it stands."""
     parts = {**{key: json.dumps(value) for key, value in fields.items()}, name: raw}
     return "{" + ", ".join(f"{json.dumps(key)}: {value}" for key, value in parts.items()) + "}"
+
+
+@pytest.mark.parametrize("kind", ["d200", "phone"])
+def test_a_preview_says_what_the_stored_camera_will(
+    client: TestClient, kind: str, request: pytest.FixtureRequest
+) -> None:
+    body = request.getfixturevalue(kind)
+    seen = client.post("/cameras/preview", json=body)
+    assert seen.status_code == 200
+    assert client.get("/cameras").json()["items"] == []
+    camera = client.post("/cameras", json=body).json()
+    curve = client.get(f"/cameras/{body['name']}/curve").json()
+    preview = seen.json()
+    assert preview.pop("points") == curve["points"]
+    assert preview == {field: camera[field] for field in preview}
+
+
+def test_a_preview_needs_no_name_and_points_to_what_is_wrong(client: TestClient, d200: dict[str, Any]) -> None:
+    del d200["name"]
+    assert client.post("/cameras/preview", json=d200).status_code == 200
+    d200["lens"]["f_number"] = 0
+    answer = client.post("/cameras/preview", json=d200)
+    assert answer.status_code == 422
+    assert [fault["pointer"] for fault in answer.json()["errors"]] == ["#/lens/f_number"]
+
+
+def test_a_camera_may_be_called_preview(client: TestClient, phone: dict[str, Any]) -> None:
+    assert client.post("/cameras", json=phone | {"name": "preview"}).status_code == 201
+    assert client.get("/cameras/preview").json()["name"] == "preview"
+    assert client.delete("/cameras/preview").status_code == 204
+
+
+def test_revisions_are_listed_newest_first_a_page_at_a_time(client: TestClient, phone: dict[str, Any]) -> None:
+    stored = [client.post("/cameras", json=phone).json()]
+    stored += [client.put("/cameras/pixel7-wide", json=phone | {"k_cam_px": k}).json() for k in (1.5, 2.0)]
+    client.delete("/cameras/pixel7-wide")
+    stored.append(client.post("/cameras", json=phone | {"k_cam_px": 2.5}).json())
+    first = client.get("/cameras/pixel7-wide/revisions", params={"limit": 3}).json()
+    rest = client.get("/cameras/pixel7-wide/revisions", params={"cursor": first["next_cursor"]}).json()
+    found = first["items"] + rest["items"]
+    assert [one["revision"] for one in found] == [4, 3, 2, 1]
+    assert [one["k_cam_px"] for one in found] == [2.5, 2.0, 1.5, 1.31]
+    assert rest["next_cursor"] is None
+    # the time of each is its own
+    assert [one["updated_at"] for one in found] == [one["updated_at"] for one in reversed(stored)]
+
+
+def test_revisions_of_nothing_and_cursors_of_nobody_are_refused(client: TestClient, phone: dict[str, Any]) -> None:
+    assert client.get("/cameras/pixel7-wide/revisions").status_code == 404
+    client.post("/cameras", json=phone)
+    cursor = client.get("/cameras", params={"limit": 1}).json()["next_cursor"] or "YWZ0ZXI6cGl4ZWw3"
+    assert client.get("/cameras/pixel7-wide/revisions", params={"cursor": cursor}).status_code == 422

@@ -1,6 +1,7 @@
 """From brightness to metres through real graphs: correction, scales, sides, no answer."""
 
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from service.inference.artifact import Interval, load_model_folder
 from service.inference.cancellation import Cancellation, Cancelled
+from service.inference.depth_map import LEAST_BLUR_ERROR_PX
 from service.inference.estimator import Estimator
 from service.inference.pair import GraphPair, RawMaps
 from service.inference.part import Part
@@ -54,6 +56,21 @@ def test_a_level_of_blur_becomes_the_thin_lens_depth_on_either_side(estimator: E
 def test_sigma_is_root_two_times_the_laplace_scale_times_depth(estimator: Estimator) -> None:
     answer = estimator.estimate(grey(80), CAMERA, "near")
     np.testing.assert_allclose(answer.sigma_m, np.sqrt(2) * LOG_DEPTH_SCALE * answer.depth_m, rtol=1e-4)
+
+
+def test_sigma_is_multiplied_by_the_models_temperature(folder: Path) -> None:
+    model = load_model_folder(folder)
+    warm = replace(model, manifest=model.manifest.model_copy(update={"temperature": 1.5}))
+    answer = Estimator.from_folder(warm).estimate(grey(80), CAMERA, "near")
+    np.testing.assert_allclose(answer.sigma_m, 1.5 * np.sqrt(2) * LOG_DEPTH_SCALE * answer.depth_m, rtol=1e-4)
+
+
+def test_sigma_is_never_below_what_a_twentieth_of_a_pixel_does_to_depth(estimator: Estimator) -> None:
+    weak = Camera(96, 64, 2.0, 0.5, 0.5)
+    answer = estimator.estimate(grey(4), weak, "near")
+    floor = thin_lens.depth_error(answer.depth_m, 2.0, weak.k_cam_px, LEAST_BLUR_ERROR_PX)
+    assert (floor > np.sqrt(2) * LOG_DEPTH_SCALE * answer.depth_m).all()
+    np.testing.assert_allclose(answer.sigma_m, floor, rtol=1e-4)
 
 
 def test_relative_defocus_of_one_and_more_is_near_whatever_is_asked(estimator: Estimator) -> None:

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from model_export.cases import Case, d200_cases, narrowed_cases, procedural_cases, shuffled_cases
+from model_export.cases import REFERENCE, Case, d200_cases, procedural_cases, shuffled_cases, viewed_cases
 from model_export.cli import commands
-from model_export.evaluate import Examiner, Pixels, blur_ranges, summarise
+from model_export.evaluate import Examiner, Pixels, Sides, blur_ranges, summarise
+from model_export.temperature import temperature
 from service.optics import thin_lens
 from service.optics.camera import Camera
 from tests.inference.oracle_pair import LOG_DEPTH_SCALE, RELATIVE_BLUR_ERROR, blur_of
@@ -77,6 +78,31 @@ def test_the_certain_half_is_that_of_the_least_stated_error() -> None:
     assert pixels.error == pytest.approx([0, 0.1, 2, 1])
 
 
+def test_intervals_hold_what_lies_within_them() -> None:
+    truth = np.array([1.0, 1.05, 1.15, 1.5], np.float32)
+    pixels = Pixels(truth, np.ones(4, np.float32), np.full(4, 0.1, np.float32))
+    assert pixels.within(1) == 0.5
+    assert pixels.within(2) == 0.75
+
+
+def test_the_temperature_makes_intervals_hold_what_they_promise() -> None:
+    rng = np.random.default_rng(1)
+    told = np.full(20_000, 0.04, np.float32)
+    pixels = Pixels((1 + 0.1 * rng.standard_normal(20_000)).astype(np.float32), np.ones_like(told), told)
+    assert temperature(pixels) == pytest.approx(2.5, rel=0.05)
+
+
+@pytest.mark.parametrize(("factor", "right", "either"), [(1.0, 0, 1), (1.05, 0, 1), (0.7, 0, 0)])
+def test_sides_are_scored_where_the_picture_is_clearly_out_of_focus(
+    oracle: Examiner, factor: float, right: float, either: float
+) -> None:
+    """The oracle takes grey for far, and the truth is near: the other hypothesis has it."""
+    outcome, _ = oracle.answer(replace(case(factor), side="auto"))
+    assert outcome.sides == Sides(right, either, 64 * 86)
+    told, _ = oracle.answer(case(factor))
+    assert told.sides is None
+
+
 def write_photo(folder: Path, name: str, depth_mm: int) -> None:
     for part in ("color", "depth"):
         (folder / part).mkdir(parents=True, exist_ok=True)
@@ -98,11 +124,21 @@ def test_real_lenses_are_scored_away_from_steps(tmp_path: Path) -> None:
 
 def test_a_narrower_view_is_enlarged_and_blurs_alike(tmp_path: Path) -> None:
     write_photo(tmp_path, "one", 900)
-    (found,) = narrowed_cases(tmp_path, 1, 0.5)
+    (found,) = viewed_cases(tmp_path, 1, 0.5)
     assert found.image.shape == (480, 640, 3)
     assert found.camera.intrinsics is not None
     assert found.camera.intrinsics.fx_px == 1050
     assert np.nanmin(found.truth_m) == pytest.approx(0.9)
+
+
+def test_a_wider_view_is_made_smaller_and_blurs_alike(tmp_path: Path) -> None:
+    write_photo(tmp_path, "one", 900)
+    (found,) = viewed_cases(tmp_path, 1, 1.5)
+    assert found.image.shape == (320, 427, 3)
+    assert (found.camera.image_width_px, found.camera.image_height_px) == (427, 320)
+    assert found.camera.k_cam_px == REFERENCE.k_cam_px
+    assert found.camera.intrinsics is not None
+    assert found.camera.intrinsics.fx_px == 350
 
 
 def test_the_control_blurs_a_frame_by_the_depth_of_another(tmp_path: Path) -> None:

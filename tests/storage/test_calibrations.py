@@ -11,7 +11,7 @@ import pytest
 from sqlalchemy import Engine, update
 from sqlalchemy.exc import StatementError
 
-from service.errors import NotFound
+from service.errors import Conflict, NotFound
 from service.optics.camera import Camera, Intrinsics
 from service.storage.calibrations import (
     CalibrationDraft,
@@ -246,3 +246,15 @@ def test_an_unknown_id_is_not_found(calibrations: Calibrations, name: str) -> No
     for action in actions:
         with pytest.raises(NotFound):
             action()
+
+
+def test_accepted_by_many_at_once_it_is_stored_once(calibrations: Calibrations, engine: Engine) -> None:
+    calibration_id = running(calibrations)
+    calibrations.finish(calibration_id, SUCCESS)
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda _: calibrations.accept(calibration_id, "bench", CAMERA), range(8)))
+    assert {(one.draft.camera, one.camera_revision) for one in found} == {("bench", 1)}
+    stored = Cameras(engine).get("bench")
+    assert (stored.camera, stored.draft.source, stored.revision) == (CAMERA, "calibration", 1)
+    with pytest.raises(Conflict, match="bench"):
+        calibrations.accept(calibration_id, "other", CAMERA)

@@ -54,6 +54,17 @@ def test_no_revision_is_overwritten(cameras: Cameras, engine: Engine) -> None:
         ]
 
 
+def test_revisions_are_read_from_the_newest_down(cameras: Cameras) -> None:
+    cameras.add(DRAFT)
+    for k_cam_px in (5.0, 6.0):
+        cameras.replace(replace(DRAFT, camera=replace(DRAFT.camera, k_cam_px=k_cam_px)))
+    newest, has_more = cameras.revisions(DRAFT.name, 2)
+    assert ([one.revision for one in newest], has_more) == ([3, 2], True)
+    assert newest[0].camera == cameras.get(DRAFT.name).camera
+    oldest, has_more = cameras.revisions(DRAFT.name, 2, before=2)
+    assert ([one.draft for one in oldest], has_more) == ([DRAFT], False)
+
+
 def test_a_taken_name_is_a_conflict(cameras: Cameras) -> None:
     cameras.add(PLAIN)
     with pytest.raises(Conflict):

@@ -1,0 +1,132 @@
+"""One photograph of the sheet measured: its grid found, and the blur of each circle read."""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.calibration.edge import EdgeError, EdgeFit, fit_edge, slice_blur
+from service.calibration.grid import FoundGrid, GridError, find_grid
+from service.calibration.pose import View
+from service.calibration.report import Method, PictureReport
+from service.calibration.target import CircleGrid
+from service.opencv import cv2
+from service.optics.light import decode_srgb
+
+LEAST_CIRCLES = 8
+CLIPPED_LEVEL = 252
+PAPER_FROM_RADII, PAPER_TO_RADII = 1.3, 1.6
+LUMINANCE = (0.2126, 0.7152, 0.0722)
+
+
+@dataclass(slots=True)
+class Measured:
+    """What one picture gave: its circles by number, where they are, and how blurred."""
+
+    report: PictureReport
+    size_px: tuple[int, int] = (0, 0)
+    grid: FoundGrid | None = None
+    circles: list[int] = field(default_factory=list)
+    centres_px: list[tuple[float, float]] = field(default_factory=list)
+    edges: list[EdgeFit] = field(default_factory=list)
+    slices_px: list[float] = field(default_factory=list)  # lambda as the paper reads it, if asked for
+    paper_levels: list[float] = field(default_factory=list)  # of the white around every circle, 0 to 255
+
+    def view(self) -> View:
+        return View(np.array(self.circles, np.int64), np.array(self.centres_px, np.float64))
+
+    def blur_px(self) -> list[float]:
+        return self.slices_px or [edge.blur_px for edge in self.edges]
+
+    def warn(self, words: str) -> None:
+        self.report = replace(self.report, warnings=(*self.report.warnings, words))
+
+
+def measure(
+    out: Measured,
+    rgb: NDArray[np.uint8],
+    grid: CircleGrid,
+    at: Callable[[float], None],
+    *,
+    method: Method = "edge",
+    partner: Measured | None = None,
+    every: int = 1,
+) -> None:
+    """Find the grid in a picture, or take it where the partner has it, and measure its circles, or every so many.
+
+    ``at(part in 0..1)`` is called circle by circle and may raise to stop the work. What is wrong with the picture is
+    among its warnings.
+    """
+    out.size_px = (rgb.shape[1], rgb.shape[0])
+    grey = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
+    at(0.05)
+    try:
+        out.grid = find_grid(grey, grid)
+    except GridError as error:
+        out.warn(str(error))
+        if partner is None or partner.grid is None or partner.size_px != out.size_px:
+            return
+        out.grid = partner.grid
+        out.warn("looked for the circles where its focused partner has them")
+    else:
+        out.report = replace(out.report, found=True)
+    at(0.1)
+    _measure_circles(method, rgb, out.grid, out, at, every)
+    out.report = replace(
+        out.report,
+        found=out.report.found or bool(out.circles),
+        circles=len(out.circles),
+        blur_px=float(np.median(out.blur_px())) if out.edges else None,
+    )
+
+
+def _measure_circles(
+    method: Method, rgb: NDArray[np.uint8], grid: FoundGrid, out: Measured, at: Callable[[float], None], every: int
+) -> None:
+    reasons: Counter[str] = Counter()
+    like: EdgeFit | None = None
+    left, top, light, peak = _light_about(rgb, grid)
+    chosen = range(0, len(grid.radii_px), every)
+    for number in chosen:
+        (x, y), radius = grid.centres_px[number].tolist(), float(grid.radii_px[number])
+        at(0.1 + 0.9 * number / len(grid.radii_px))
+        out.paper_levels.append(_paper_level(peak, x - left, y - top, radius))
+        try:
+            if out.paper_levels[-1] >= CLIPPED_LEVEL:
+                raise EdgeError("the paper around it is overexposed: expose so that white stays grey")
+            edge = fit_edge(light, x - left, y - top, radius, like)
+            if method == "paper":
+                out.slices_px.append(slice_blur(light, edge.x_px, edge.y_px, edge.radius_px))
+        except EdgeError as error:
+            reasons[str(error)] += 1
+            continue
+        like = edge
+        out.circles.append(number)
+        out.centres_px.append((edge.x_px + left, edge.y_px + top))
+        out.edges.append(edge)
+    for reason, count in reasons.most_common(3):
+        out.warn(f"{count} of {len(chosen)} circles not measured: {reason}")
+    if every == 1 and 0 < len(out.circles) < LEAST_CIRCLES:
+        out.warn(f"left out: {len(out.circles)} circles do not place the sheet, {LEAST_CIRCLES} are needed")
+
+
+def _light_about(rgb: NDArray[np.uint8], grid: FoundGrid) -> tuple[int, int, NDArray[np.float32], NDArray[np.uint8]]:
+    """The part of the picture with the grid: its corner (x, y), luminance in linear light, the brightest channel."""
+    reach = 3 * grid.radii_px[:, None]
+    low = np.maximum(np.floor((grid.centres_px - reach).min(0)).astype(int), 0)
+    high = np.ceil((grid.centres_px + reach).max(0)).astype(int) + 1
+    part = rgb[low[1] : high[1], low[0] : high[0]]
+    curve = decode_srgb(np.arange(256, dtype=np.float32) / np.float32(255))
+    weighted = [weight * curve[part[..., i]] for i, weight in enumerate(LUMINANCE)]
+    return int(low[0]), int(low[1]), np.asarray(sum(weighted), np.float32), part.max(axis=2)
+
+
+def _paper_level(peak: NDArray[np.uint8], x: float, y: float, radius: float) -> float:
+    """The median level, 0 to 255, of the paper around a circle."""
+    angle = np.linspace(0, 2 * np.pi, 32, endpoint=False)
+    ring = np.concatenate([np.stack([np.cos(angle), np.sin(angle)], 1) * r for r in (PAPER_FROM_RADII, PAPER_TO_RADII)])
+    places = np.rint(ring * radius + (x, y)).astype(int)
+    inside = (places >= 0).all(1) & (places < peak.shape[::-1]).all(1)
+    return float(np.median(peak[places[inside, 1], places[inside, 0]])) if inside.any() else 0.0

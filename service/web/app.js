@@ -1,0 +1,167 @@
+/** The page's frame: tabs by location hash, the cameras that all of them use, the API key, and what is said aloud. */
+
+import { KEY_CHANGED, Problem, forgetKey, getJson, problemOf, storedKey } from "./api.js";
+import { CalibrateView } from "./calibrate.js";
+import { CamerasView } from "./cameras.js";
+import { DepthView } from "./depth.js";
+import { KeyDialog } from "./key_dialog.js";
+import { ProblemBox } from "./problem_box.js";
+import { StatusView } from "./status.js";
+import { html, render, useCallback, useEffect, useState } from "./vendor/preact.js";
+
+/** @typedef {"depth" | "cameras" | "calibrate" | "status"} Tab */
+
+/**
+ * What every view gets. Views stay mounted when another is in front, so that nothing is lost.
+ *
+ * @typedef {object} ViewProps
+ * @property {boolean} shown whether the view's tab is in front
+ * @property {any[] | null} cameras as the API gives them, by name; null while they load
+ * @property {string | null} camera the name that `go` brought along, for the view in front
+ * @property {() => Promise<void>} reloadCameras
+ * @property {(tab: Tab, about?: {camera?: string}) => void} go change the tab, and pick the camera there
+ * @property {(text: string) => void} announce say it to who cannot see it
+ */
+
+/** @type {{tab: Tab, title: string, View: (props: ViewProps) => any}[]} */
+const TABS = [
+  { tab: "depth", title: "Depth", View: DepthView },
+  { tab: "cameras", title: "Cameras", View: CamerasView },
+  { tab: "calibrate", title: "Calibrate", View: CalibrateView },
+  { tab: "status", title: "Status", View: StatusView },
+];
+const CAMERAS_A_PAGE = 200;
+
+/** @returns {{tab: Tab, camera: string | null}} from `#tab` or `#tab/camera` */
+function readHash() {
+  const [name, camera = null] = location.hash.slice(1).split("/", 2);
+  const known = TABS.find(({ tab }) => tab === name) ?? TABS[0];
+  try {
+    return { tab: known.tab, camera: camera && decodeURIComponent(camera) };
+  } catch {
+    return { tab: known.tab, camera: null };
+  }
+}
+
+/** @type {ViewProps["go"]} */
+function go(tab, { camera } = {}) {
+  location.hash = camera ? `${tab}/${encodeURIComponent(camera)}` : tab;
+}
+
+function useHash() {
+  const [place, setPlace] = useState(readHash);
+  useEffect(() => {
+    const read = () => setPlace(readHash());
+    addEventListener("hashchange", read);
+    return () => removeEventListener("hashchange", read);
+  }, []);
+  return place;
+}
+
+async function everyCamera() {
+  const found = [];
+  let cursor = null;
+  do {
+    const after = cursor === null ? "" : `&cursor=${encodeURIComponent(cursor)}`;
+    const page = await getJson(`cameras?limit=${CAMERAS_A_PAGE}${after}`);
+    found.push(...page.items);
+    cursor = page.next_cursor;
+  } while (cursor !== null);
+  return found;
+}
+
+function App() {
+  const place = useHash();
+  const [cameras, setCameras] = useState(/** @type {any[] | null} */ (null));
+  const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
+  const [said, setSaid] = useState("");
+  const [hasKey, setHasKey] = useState(storedKey() !== null);
+
+  const reloadCameras = useCallback(async () => {
+    try {
+      setCameras(await everyCamera());
+      setProblem(null);
+    } catch (error) {
+      setProblem(problemOf(error));
+    }
+  }, []);
+  const announce = useCallback((/** @type {string} */ text) => {
+    // the same words again are said again
+    setSaid((before) => (before === text ? `${text}\u00a0` : text));
+  }, []);
+  useEffect(() => {
+    reloadCameras();
+  }, []);
+  useEffect(() => {
+    function onKeyChanged() {
+      setHasKey(storedKey() !== null);
+      if (problem !== null && storedKey() !== null) reloadCameras();
+    }
+    addEventListener(KEY_CHANGED, onKeyChanged);
+    return () => removeEventListener(KEY_CHANGED, onKeyChanged);
+  }, [problem]);
+
+  /** @param {KeyboardEvent} event */
+  function onKeyDown(event) {
+    const at = TABS.findIndex(({ tab }) => tab === place.tab);
+    const to = { ArrowLeft: at - 1, ArrowRight: at + 1, Home: 0, End: TABS.length - 1, " ": at }[event.key];
+    if (to === undefined || event.altKey || event.ctrlKey || event.metaKey) return;
+    event.preventDefault();
+    const { tab } = TABS[(to + TABS.length) % TABS.length];
+    go(tab);
+    document.getElementById(`tab-${tab}`)?.focus();
+  }
+
+  return html`
+    <header class="bar">
+      <h1><a href="#depth">camind</a></h1>
+      <nav role="tablist" aria-label="Parts of the page" onKeyDown=${onKeyDown}>
+        ${TABS.map(
+          ({ tab, title }) => html`<a
+            key=${tab}
+            id=${`tab-${tab}`}
+            role="tab"
+            href=${`#${tab}`}
+            aria-selected=${tab === place.tab}
+            aria-controls=${`panel-${tab}`}
+            tabindex=${tab === place.tab ? 0 : -1}
+            >${title}</a
+          >`,
+        )}
+      </nav>
+      ${hasKey &&
+      html`<button
+        type="button"
+        class="quiet"
+        onClick=${() => {
+          forgetKey();
+          location.reload();
+        }}
+      >
+        Forget API key
+      </button>`}
+    </header>
+    <main>
+      <${ProblemBox} problem=${problem} onRetry=${reloadCameras} />
+      ${TABS.map(
+        ({ tab, View }) => html`<section
+          key=${tab}
+          id=${`panel-${tab}`}
+          role="tabpanel"
+          aria-labelledby=${`tab-${tab}`}
+          hidden=${tab !== place.tab}
+        >
+          <${View}
+            shown=${tab === place.tab}
+            camera=${tab === place.tab ? place.camera : null}
+            ...${{ cameras, reloadCameras, go, announce }}
+          />
+        </section>`,
+      )}
+    </main>
+    <p class="visually-hidden" role="status" aria-live="polite">${said}</p>
+    <${KeyDialog} />
+  `;
+}
+
+render(html`<${App} />`, document.body);

@@ -1,0 +1,156 @@
+/** Cameras as files: all or one out, and back in after it is shown what that would do. */
+
+import { Problem, problemOf, request } from "./api.js";
+import { differences, specsOf } from "./camera_specs.js";
+import { counted } from "./numbers.js";
+import { save } from "./save.js";
+import { html, useEffect, useRef, useState } from "./vendor/preact.js";
+
+const JSON_TYPE = { "Content-Type": "application/json" };
+
+/** @typedef {{camera: any, name: string, does: "create" | "update" | "nothing" | "refuse" | "done", words: string, revision: number | null}} Step */
+
+/**
+ * @param {any[]} cameras
+ * @param {string} name of the file
+ */
+export function exportCameras(cameras, name) {
+  const text = `${JSON.stringify({ cameras: cameras.map(specsOf) }, null, 2)}\n`;
+  save(new Blob([text], { type: "application/json" }), `${name}.json`);
+}
+
+/**
+ * @param {{file: File, cameras: any[], onClose: (stored: number) => void}} props
+ */
+export function ImportDialog({ file, cameras, onClose }) {
+  const dialog = useRef(/** @type {HTMLDialogElement | null} */ (null));
+  const [steps, setSteps] = useState(/** @type {Step[] | null} */ (null));
+  const [fault, setFault] = useState("");
+  const [isBusy, setIsBusy] = useState(false);
+  const wanted = (steps ?? []).filter(({ does }) => does === "create" || does === "update");
+  const stored = (steps ?? []).filter(({ does }) => does === "done").length;
+
+  useEffect(() => {
+    dialog.current?.showModal();
+    planOf(file, cameras).then(setSteps, (error) => setFault(error.detail ?? error.message));
+  }, []);
+
+  async function carryOut() {
+    setIsBusy(true);
+    for (const step of wanted) {
+      const done = await stepDone(step);
+      setSteps((before) => (before ?? []).map((one) => (one === step ? done : one)));
+    }
+    setIsBusy(false);
+  }
+
+  return html`
+    <dialog ref=${dialog} class="wide" aria-labelledby="import-title" onClose=${() => onClose(stored)}>
+      <div class="stack">
+        <h2 id="import-title">Import cameras</h2>
+        ${fault && html`<p class="fault" role="alert">${fault}</p>`}
+        ${!fault && steps === null && html`<p role="status">Reading ${file.name} ...</p>`}
+        ${steps &&
+        html`<div class="table-scroll" tabindex="0" role="region" aria-label="What the import does">
+          <table>
+            <thead>
+              <tr><th scope="col">Camera</th><th scope="col">What happens</th></tr>
+            </thead>
+            <tbody>
+              ${steps.map(
+                ({ name, does, words }) => html`<tr>
+                  <th scope="row">${name}</th>
+                  <td><span class=${`badge ${TONES[does]}`}>${LABELS[does]}</span> ${words}</td>
+                </tr>`,
+              )}
+            </tbody>
+          </table>
+        </div>`}
+        <div class="row">
+          ${wanted.length > 0 &&
+          html`<button type="button" class="primary" disabled=${isBusy} onClick=${carryOut}>
+            Import ${counted(wanted.length, "camera")}
+          </button>`}
+          <button type="button" onClick=${() => dialog.current?.close()}>${stored > 0 ? "Close" : "Cancel"}</button>
+        </div>
+      </div>
+    </dialog>
+  `;
+}
+
+const LABELS = { create: "new", update: "changes", nothing: "the same", refuse: "refused", done: "stored" };
+const TONES = { create: "good", update: "warn", nothing: "", refuse: "bad", done: "good" };
+
+/**
+ * @param {File} file
+ * @param {any[]} cameras that are there
+ * @returns {Promise<Step[]>}
+ */
+async function planOf(file, cameras) {
+  /** @type {any} */
+  let content;
+  try {
+    content = JSON.parse(await file.text());
+  } catch {
+    throw new Error(`${file.name} is no JSON: export one here to see what it looks like.`);
+  }
+  const listed = Array.isArray(content) ? content : (content?.cameras ?? content?.items ?? [content]);
+  if (!Array.isArray(listed) || listed.length === 0) throw new Error(`There is no camera in ${file.name}.`);
+  const names = listed.map((one) => one?.name);
+  const steps = [];
+  for (const [place, one] of listed.entries()) {
+    const isTwice = names.indexOf(one?.name) < place;
+    steps.push(isTwice ? refused(one, "its name stands in the file twice") : await planned(one, cameras));
+  }
+  return steps;
+}
+
+/**
+ * @param {any} given
+ * @param {any[]} cameras
+ * @returns {Promise<Step>}
+ */
+async function planned(given, cameras) {
+  if (typeof given !== "object" || given === null || typeof given.name !== "string") {
+    return refused(given, "it is no camera with a name");
+  }
+  // what the API answers has more than it takes
+  const camera = "revision" in given ? specsOf(given) : given;
+  try {
+    await request("cameras/preview", { method: "POST", headers: JSON_TYPE, body: JSON.stringify(camera) });
+  } catch (error) {
+    if (error instanceof Problem && error.status === 422) return refused(given, error.detail);
+    throw error;
+  }
+  const { name } = camera;
+  const here = cameras.find((one) => one.name === name);
+  if (!here) return { camera, name, does: "create", words: "", revision: null };
+  const changed = differences(here, camera).map(({ path }) => path.replace("/", " "));
+  if (changed.length === 0) return { camera, name, does: "nothing", words: "", revision: here.revision };
+  const words = `${changed.join(", ")}: revision ${here.revision} becomes ${here.revision + 1}`;
+  return { camera, name, does: "update", words, revision: here.revision };
+}
+
+/** @param {any} given @param {string} words @returns {Step} */
+function refused(given, words) {
+  return { camera: given, name: String(given?.name ?? "?"), does: "refuse", words, revision: null };
+}
+
+/** @param {Step} step @returns {Promise<Step>} */
+async function stepDone(step) {
+  const { camera, name, revision } = step;
+  const body = JSON.stringify(camera);
+  try {
+    const answer =
+      revision === null
+        ? await request("cameras", { method: "POST", headers: JSON_TYPE, body })
+        : await request(`cameras/${encodeURIComponent(name)}`, {
+            method: "PUT",
+            headers: { ...JSON_TYPE, "If-Match": `"${revision}"` },
+            body,
+          });
+    return { ...step, does: "done", words: `as revision ${(await answer.json()).revision}` };
+  } catch (error) {
+    return { ...step, does: "refuse", words: problemOf(error).detail };
+  }
+}

@@ -1,0 +1,124 @@
+/** What a set of photographs of the sheet lacks yet, and the one to take next, in words. */
+
+import { short } from "./numbers.js";
+
+/**
+ * @typedef {object} Seen a photograph in which the grid was found
+ * @property {"focused" | "defocused"} role
+ * @property {number} width before EXIF orientation
+ * @property {number} height
+ * @property {{u_px: number, v_px: number}[]} circles
+ * @property {number | null} blur in px
+ * @property {number | null} distance in metres
+ * @property {number | null} tilt in degrees
+ */
+
+export const WANTED = 8;
+const COLUMNS = 6;
+const ROWS = 4;
+const TILTED_DEG = 10;
+const WANTED_TILTED = 3;
+const WANTED_A_SIDE = 2;
+const SIDE = 1.12; // times the focus distance: nearer than 1/1.12 and farther than 1.12 count as a side
+/** @typedef {[number, number]} Between */
+/** @type {Between} */
+const NEARER = [0.6, 0.8];
+/** @type {Between} */
+const FARTHER = [1.25, 1.7];
+
+/**
+ * How many circles were in each part of the frame.
+ *
+ * @param {Seen[]} seen
+ * @returns {number[][]} rows of columns
+ */
+export function coverageOf(seen) {
+  const cells = Array.from({ length: ROWS }, () => Array(COLUMNS).fill(0));
+  const place = (/** @type {number} */ at, /** @type {number} */ size, /** @type {number} */ count) =>
+    Math.min(count - 1, Math.max(0, Math.floor(((at + 0.5) / size) * count)));
+  for (const { circles, width, height } of seen) {
+    for (const { u_px: u, v_px: v } of circles) cells[place(v, height, ROWS)][place(u, width, COLUMNS)] += 1;
+  }
+  return cells;
+}
+
+/**
+ * Where the lens seems to be focused: as told, else the distance of the sharpest photograph.
+ *
+ * @param {Seen[]} seen
+ * @param {number | null} told
+ */
+export function focusOf(seen, told) {
+  if (told !== null) return told;
+  const known = seen.filter(({ role, blur, distance }) => role === "defocused" && blur !== null && distance !== null);
+  known.sort((a, b) => Number(a.blur) - Number(b.blur));
+  return known[0]?.distance ?? null;
+}
+
+/**
+ * @param {Seen[]} seen
+ * @param {number | null} toldFocus in metres
+ * @returns {{next: string, isEnough: boolean}}
+ */
+export function adviceFor(seen, toldFocus) {
+  const left = WANTED - seen.length;
+  const tilted = seen.filter(({ tilt }) => tilt !== null && tilt >= TILTED_DEG).length;
+  const tilt = tilted < WANTED_TILTED ? ", tilted by 15 to 25 degrees" : "";
+  if (seen.length === 0) {
+    return { next: "Begin with one in which the sheet is sharp and fills most of the frame.", isEnough: false };
+  }
+  const side = missingSide(seen, focusOf(seen, toldFocus));
+  if (side) return { next: `Next: one ${side}${tilt}.`, isEnough: false };
+  const corner = missingCorner(coverageOf(seen));
+  if (corner && (left > 0 || seen.length < WANTED + 4)) {
+    return { next: `Next: one with the sheet towards the ${corner}${tilt}.`, isEnough: left <= 0 };
+  }
+  if (tilt && seen.some((one) => one.tilt !== null)) return { next: `Next: one${tilt}.`, isEnough: left <= 0 };
+  if (left > 0) return { next: `Next: ${left === 1 ? "one more" : `${left} more`}, each at another distance and tilt.`, isEnough: false };
+  return { next: "This is a good set: start the calibration.", isEnough: true };
+}
+
+/**
+ * @param {Seen[]} seen
+ * @param {number | null} focus in metres
+ * @returns {string | null} where too few were taken
+ */
+function missingSide(seen, focus) {
+  const defocused = seen.filter(({ role }) => role === "defocused");
+  const distances = defocused.flatMap(({ distance }) => (distance === null ? [] : [distance]));
+  if (focus === null || distances.length === 0) {
+    // without a focal length there is no distance, but the sheet's size in the frame tells near from far
+    const sizes = defocused.map(sizeOf).sort((a, b) => a - b);
+    if (sizes.length > 0 && sizes[sizes.length - 1] > sizes[0] * SIDE ** 2) return null;
+    return sizes.length % 2 === 0 ? "nearer than the plane in focus" : "farther than the plane in focus";
+  }
+  const at = (/** @type {Between} */ [low, high]) => `at ${short(focus * low, 2)}–${short(focus * high, 2)} m`;
+  const nearer = distances.filter((distance) => distance < focus / SIDE).length;
+  const farther = distances.filter((distance) => distance > focus * SIDE).length;
+  if (nearer < WANTED_A_SIDE && nearer <= farther) return at(NEARER);
+  if (farther < WANTED_A_SIDE) return at(FARTHER);
+  return nearer < WANTED_A_SIDE ? at(NEARER) : null;
+}
+
+/** @param {Seen} seen the sheet's width as a part of the frame's */
+function sizeOf({ circles, width }) {
+  const across = circles.map(({ u_px: u }) => u);
+  const down = circles.map(({ v_px: v }) => v);
+  return Math.hypot(Math.max(...across) - Math.min(...across), Math.max(...down) - Math.min(...down)) / width;
+}
+
+/**
+ * @param {number[][]} cells
+ * @returns {string | null} the first corner without a circle
+ */
+function missingCorner(cells) {
+  const [top, bottom] = [cells[0], cells[ROWS - 1]];
+  const corners = /** @type {[string, number[], number[]][]} */ ([
+    ["upper left corner", top, [0, 1]],
+    ["upper right corner", top, [COLUMNS - 2, COLUMNS - 1]],
+    ["lower left corner", bottom, [0, 1]],
+    ["lower right corner", bottom, [COLUMNS - 2, COLUMNS - 1]],
+  ]);
+  const found = corners.find(([, row, columns]) => columns.every((column) => row[column] === 0));
+  return found ? found[0] : null;
+}

@@ -1,0 +1,100 @@
+/** What the answer says in words: at the pointer, between two points, and how long it took. */
+
+import { html } from "./vendor/preact.js";
+
+/**
+ * @param {number} value
+ * @param {number} [digits] of its decimals; a millimetre by default
+ */
+export function metres(value, digits = 3) {
+  return `${value.toFixed(digits)} m`;
+}
+
+/** @param {{reading: import("./maps.js").Reading | null}} props */
+export function Readout({ reading }) {
+  return html`<section class="card stack depth-readout" aria-label="Under the pointer">
+    <h3>Under the pointer</h3>
+    ${reading === null
+      ? html`<p class="depth-metres depth-none">–</p>
+          <p class="hint">Point at the picture, or go into it with Tab and the arrow keys.</p>`
+      : html`<p class="depth-metres">
+            ${reading.depthM === null
+              ? "No answer here"
+              : html`<strong data-value="depth">${metres(reading.depthM)}</strong>${" "}
+                  <span data-value="sigma">± ${metres(reading.sigmaM ?? 0)}</span>`}
+          </p>
+          <dl class="facts">
+            <dt>Side</dt>
+            <dd>${sideOf(reading.pNear)}</dd>
+            <dt>Or else</dt>
+            <dd data-value="other">
+              ${reading.otherM === null
+                ? "no other distance fits"
+                : `${metres(reading.otherM)}, ${percent(Math.min(reading.pNear, 1 - reading.pNear))}`}
+            </dd>
+            <dt>Blur</dt>
+            <dd data-value="blur">${reading.blurPx.toFixed(2)} px</dd>
+            <dt>Pixel</dt>
+            <dd data-value="pixel">${reading.u}, ${reading.v}</dd>
+          </dl>`}
+  </section>`;
+}
+
+/**
+ * @param {{
+ *   marks: import("./depth.js").Pixel[],
+ *   measured: import("./depth.js").Measured | null,
+ *   hasPoints: boolean,
+ *   onClear: () => void,
+ * }} props
+ */
+export function Distance({ marks, measured, hasPoints, onClear }) {
+  const says = () => {
+    if (!hasPoints) return "Needs the camera's focal length: give the camera its lens or its intrinsics.";
+    if (marks.length === 0) return "Click two points of the picture.";
+    if (marks.length === 1) return "Click the second point.";
+    return measured === "unknown" ? "One of the points has no answer." : "";
+  };
+  return html`<section class="card stack" aria-label="Distance in space">
+    <h3>Distance in space</h3>
+    ${measured !== null && measured !== "unknown"
+      ? html`<p class="depth-metres">
+          <strong data-value="distance">${metres(measured.distanceM)}</strong>${" "}
+          <span data-value="distance-sigma">± ${metres(measured.sigmaM)}</span>
+        </p>`
+      : html`<p class="hint">${says()}</p>`}
+    ${marks.length > 0 &&
+    html`<div class="row"><button type="button" onClick=${onClear}>Clear points</button></div>`}
+  </section>`;
+}
+
+/** @param {{timings: [string, number][], model: string}} props */
+export function Timings({ timings, model }) {
+  const totalMs = timings.reduce((sum, [, ms]) => sum + ms, 0);
+  return html`<details class="card">
+    <summary>The service took ${(totalMs / 1000).toFixed(2)} s</summary>
+    <table class="depth-timings">
+      <tbody>
+        ${timings.map(
+          ([stage, ms]) => html`<tr key=${stage}>
+            <th scope="row">${stage}</th>
+            <td class="number">${ms.toFixed(0)} ms</td>
+            <td><span style=${{ width: `${(100 * ms) / (totalMs || 1)}%` }}></span></td>
+          </tr>`,
+        )}
+      </tbody>
+    </table>
+    <p class="hint">${model}</p>
+  </details>`;
+}
+
+/** @param {number} pNear */
+function sideOf(pNear) {
+  if (pNear >= 0.5) return `nearer than focus, ${percent(pNear)}`;
+  return `beyond focus, ${percent(1 - pNear)}`;
+}
+
+/** @param {number} share */
+function percent(share) {
+  return `${Math.round(100 * share)}\u00a0%`;
+}

@@ -1,0 +1,29 @@
+/** A line of text with its label, and under it what it is for or what is wrong with it. */
+
+import { html } from "./vendor/preact.js";
+
+/**
+ * @param {{id: string, label: string, value: string, onInput: (value: string) => void, fault?: string, hint?: any,
+ *   kind?: string, list?: string, disabled?: boolean, invalid?: boolean}} props
+ */
+export function TextField({ id, label, value, onInput, fault = "", hint, kind, list, disabled = false, invalid = fault !== "" }) {
+  return html`
+    <div class="field">
+      <label for=${id}>${label}</label>
+      <input
+        id=${id}
+        type="text"
+        inputmode=${kind}
+        list=${list}
+        autocomplete="off"
+        spellcheck=${false}
+        value=${value}
+        disabled=${disabled}
+        aria-invalid=${invalid}
+        aria-describedby=${`${id}-told`}
+        onInput=${(/** @type {any} */ event) => onInput(event.target.value)}
+      />
+      <span id=${`${id}-told`} class=${fault ? "fault" : "hint"}>${fault || hint}</span>
+    </div>
+  `;
+}

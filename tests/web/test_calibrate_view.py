@@ -1,0 +1,199 @@
+"""The calibration in a real browser, on simulated photographs of the sheet: from the print to the camera."""
+
+import re
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from uuid import uuid4
+
+import cv2
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from model_export.served import Server, serving
+from tests.simulated_sheets import CAMERA, DEPTHS_M, GRID, shots
+from tests.web.watched import watched
+
+LONG_MS = 120_000
+OVERFLOW = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+SHEET = {"Rows": GRID.rows, "Columns": GRID.columns, "Spacing (mm)": GRID.spacing_mm, "Diameter (mm)": GRID.diameter_mm}
+K_CAM = {
+    "image_width_px": CAMERA.width_px,
+    "image_height_px": CAMERA.height_px,
+    "focus_distance_m": 0.5,
+    "k_cam_px": 3.0,
+}
+LENS = {"fx_px": 900, "fy_px": 900, "cx_px": 400, "cy_px": 300}
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Of the sheet, nearer and farther than focus, and one of nothing."""
+    folder = tmp_path_factory.mktemp("photographs")
+    taken = [
+        (f"at {z:g} m.jpg", rgb) for z, (_, _, rgb) in zip(DEPTHS_M[::2], shots(CAMERA, DEPTHS_M[::2]), strict=True)
+    ]
+    taken.append(("nothing.png", np.full((CAMERA.height_px, CAMERA.width_px, 3), 120, np.uint8)))
+    for name, rgb in taken:
+        cv2.imwrite(str(folder / name), rgb[..., ::-1])
+    return [folder / name for name, _ in taken]
+
+
+@pytest.fixture
+def name() -> str:
+    """A camera's that nobody had."""
+    return f"bench-{uuid4().hex[:8]}"
+
+
+@pytest.fixture(autouse=True)
+def no_calibration(served: Server) -> Iterator[None]:
+    yield
+    for item in served.ask("GET", "/calibrations").json()["items"]:
+        served.ask("DELETE", f"/calibrations/{item['id']}")
+
+
+def to_photographs(page: Page, name: str, ruler_mm: str = "100") -> None:
+    page.goto("#calibrate")
+    page.get_by_text("Another grid or paper").click()
+    for label, value in SHEET.items():
+        page.get_by_label(label, exact=True).fill(f"{value:g}")
+    page.get_by_label("Measure this").fill(ruler_mm)
+    page.get_by_role("button", name="Next: photographs").click()
+    page.get_by_label("Camera", exact=True).fill(name)
+
+
+def drop(page: Page, *files: Path, role: str = "defocused") -> None:
+    page.locator(f"input[data-role={role}]").set_input_files(files)
+
+
+def test_the_sheet_is_what_the_service_prints(page: Page, served: Server, expected_errors: list[str]) -> None:
+    expected_errors.append("status of 422")
+    page.goto("#calibrate")
+    expect(page.get_by_role("img", name=re.compile("11 rows and 4 columns"))).to_be_visible()
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Download PDF").click()
+    assert download.value.path().read_bytes() == served.ask("GET", "/calibrate/target.pdf").body
+    page.get_by_label("Measure this").fill("98,6")
+    expect(page.get_by_text("Circles of 11.83 mm, 19.72 mm apart")).to_be_visible()
+    page.get_by_text("Another grid or paper").click()
+    page.get_by_label("Spacing (mm)").fill("60")
+    expect(page.get_by_label("Spacing (mm)")).to_have_accessible_description(re.compile("too large for a4"))
+    expect(page.get_by_role("button", name="Next: photographs")).to_be_disabled()
+
+
+def test_every_photograph_says_at_once_what_it_shows(
+    page: Page, served: Server, photographs: list[Path], name: str, barriers: Callable[[Page], list[str]]
+) -> None:
+    camera = {"name": name, **K_CAM, "intrinsics": LENS}
+    assert served.add(camera) == 201
+    to_photographs(page, name)
+    expect(page.get_by_text("Begin with one")).to_be_visible()
+    drop(page, photographs[0], photographs[-1])
+    shown = page.get_by_role("list", name="Photographs").get_by_role("listitem")
+    near = shown.filter(has_text=photographs[0].name)
+    expect(near.get_by_text("found", exact=True)).to_be_visible()
+    expect(near.get_by_role("img", name=re.compile("with 21 circles found"))).to_be_visible()
+    expect(near).to_contain_text(re.compile(r"Distance0\.3[34]\d* m"))
+    expect(near).to_contain_text("Exposuregood")
+    nothing = shown.filter(has_text="nothing.png")
+    expect(nothing.get_by_text("no grid", exact=True)).to_be_visible()
+    expect(nothing).to_contain_text("no grid of dark circles was found")
+    expect(page.get_by_role("img", name=re.compile("parts of the frame"))).to_be_visible()
+    expect(page.get_by_role("img", name="Blur of each photograph")).to_be_visible()
+    # said where it is read, and aloud
+    expect(page.get_by_text(re.compile(r"Next: one at [\d.]+\S[\d.]+ m, tilted by 15 to 25 degrees"))).to_have_count(2)
+    assert barriers(page) == []
+    nothing.get_by_role("button", name="Remove nothing.png").click()
+    expect(shown).to_have_count(1)
+    page.set_viewport_size({"width": 360, "height": 740})
+    assert page.evaluate(OVERFLOW) <= 0
+
+
+def test_a_file_that_is_no_photograph_is_told(
+    page: Page, tmp_path: Path, name: str, expected_errors: list[str]
+) -> None:
+    expected_errors.append("status of 4")
+    file = tmp_path / "notes.jpg"
+    file.write_text("no picture")
+    to_photographs(page, name)
+    drop(page, file)
+    expect(page.get_by_text("not readable")).to_be_visible()
+
+
+def test_a_set_becomes_a_camera(
+    page: Page,
+    browser: Browser,
+    served: Server,
+    photographs: list[Path],
+    name: str,
+    barriers: Callable[[Page], list[str]],
+) -> None:
+    to_photographs(page, name, ruler_mm="99")
+    drop(page, *photographs)
+    page.get_by_label("Focus distance (m)").fill("0.495")
+    page.get_by_role("button", name="Start the calibration").click()
+    expect(page.get_by_role("heading", name=f"Calibrating {name}")).to_be_visible()
+    expect(page.get_by_role("progressbar", name="Progress")).to_be_visible()
+    expect(page.get_by_role("row", name=photographs[0].name)).to_contain_text("found")
+    # who comes back finds it where it is
+    with watched(browser, served.url, []) as other:
+        other.goto("#calibrate")
+        expect(other.get_by_role("heading", name=f"Calibrating {name}")).to_be_visible()
+    expect(page.get_by_role("heading", name=f"What was found for {name}")).to_be_visible(timeout=LONG_MS)
+    item = served.ask("GET", "/calibrations?limit=1").json()["items"][0]
+    job = served.ask("GET", f"/calibrations/{item['id']}").json()
+    assert job["settings"]["pattern"]["spacing_mm"] == pytest.approx(0.99 * GRID.spacing_mm)
+    found = job["result"]["k_cam_px"]
+    expect(page.get_by_text(f"{found['low']:.4g} to {found['high']:.4g} at 95 %")).to_be_visible()
+    expect(page.get_by_role("img", name="Blur of every circle")).to_be_visible()
+    expect(page.get_by_role("img", name="What the fit leaves")).to_be_visible()
+    expect(page.get_by_text("1 of 4 photographs were of no use")).to_be_visible()
+    assert served.ask("GET", f"/cameras/{name}").status == 404
+    assert barriers(page) == []
+    page.get_by_role("button", name="Accept as a new camera").click()
+    expect(page.get_by_role("status")).to_have_text(f"Stored as revision 1 of camera {name}.")
+    camera = served.ask("GET", f"/cameras/{name}").json()
+    assert (camera["source"], camera["k_cam_px"]) == ("calibration", pytest.approx(found["value"]))
+    page.get_by_role("button", name="See the camera").click()
+    expect(page.get_by_role("heading", name=name)).to_be_visible()
+
+
+def test_one_that_found_nothing_says_why_and_goes_back(page: Page, photographs: list[Path], name: str) -> None:
+    to_photographs(page, name)
+    drop(page, photographs[-1])
+    page.get_by_role("button", name="Start the calibration").click()
+    expect(page.get_by_role("heading", name="The calibration found no camera")).to_be_visible(timeout=LONG_MS)
+    expect(page.get_by_role("alert")).to_contain_text("could be measured in none of the photographs")
+    page.get_by_role("button", name="Back to the photographs").click()
+    expect(page.get_by_role("list", name="Photographs").get_by_role("listitem")).to_have_count(1)
+
+
+def test_a_running_one_is_cancelled(page: Page, served: Server, photographs: list[Path], name: str) -> None:
+    to_photographs(page, name)
+    drop(page, *photographs[:3])
+    page.get_by_role("button", name="Start the calibration").click()
+    page.get_by_role("button", name="Cancel").click()
+    expect(page.get_by_role("heading", name="The calibration was cancelled")).to_be_visible()
+    newest = served.ask("GET", "/calibrations").json()["items"][0]
+    assert (newest["camera"], newest["state"]) == (name, "cancelled")
+    expect(page.get_by_role("row", name=re.compile(f"{name}.*cancelled"))).to_be_visible()
+
+
+def test_a_service_that_goes_away_is_told(
+    browser: Browser, photographs: list[Path], name: str, tmp_path: Path, tiny_model_dir: Path
+) -> None:
+    with (
+        serving(tmp_path / "data", "--model", tiny_model_dir) as server,
+        watched(browser, server.url, ["net::ERR_"]) as page,
+    ):
+        to_photographs(page, name)
+        drop(page, photographs[0])
+        expect(page.get_by_text("found", exact=True)).to_be_visible()
+        server.stop(signal.SIGKILL)
+        drop(page, photographs[1])
+        expect(page.get_by_text("not looked at", exact=True)).to_be_visible()
+        page.get_by_role("button", name="Start the calibration").click()
+        expect(page.get_by_role("alert")).to_contain_text("The service does not answer.")
+        # nothing of what was done is lost
+        expect(page.get_by_role("list", name="Photographs").get_by_role("listitem")).to_have_count(2)

@@ -1,0 +1,211 @@
+"""Cameras in a real browser: made, changed against another's change, deleted, exported and imported."""
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from model_export.served import Server
+
+JSON = {"Content-Type": "application/json"}
+LENS = {"Focal length (mm)": "35", "f-number": "2.8", "Pixel pitch (µm)": "6.05", "Sensor width (px)": "3872"}
+FRAME = {"Image width (px)": "645", "Image height (px)": "432", "Focus distance (m)": "2"}
+OVERFLOW = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+
+
+@pytest.fixture(autouse=True)
+def no_cameras(served: Server) -> Iterator[None]:
+    yield
+    for camera in served.ask("GET", "/cameras").json()["items"]:
+        served.ask("DELETE", f"/cameras/{camera['name']}")
+
+
+@pytest.fixture
+def phone(phone: dict[str, Any]) -> dict[str, Any]:
+    """One whose name nobody had, for revisions are never counted anew."""
+    return phone | {"name": f"phone-{uuid4().hex[:8]}"}
+
+
+def fill(page: Page, fields: dict[str, str]) -> None:
+    for label, text in fields.items():
+        page.get_by_label(label, exact=True).fill(text)
+
+
+def read(served: Server, name: str) -> dict[str, Any]:
+    return served.ask("GET", f"/cameras/{name}").json()
+
+
+def open_camera(page: Page, served: Server, camera: dict[str, Any]) -> None:
+    assert served.add(camera) == 201
+    page.goto("#cameras")
+    page.get_by_role("button", name=camera["name"]).click()
+
+
+def test_a_camera_is_made_from_its_lens_while_it_says_what_it_can_measure(
+    page: Page, served: Server, d200: dict[str, Any], barriers: Callable[[Page], list[str]]
+) -> None:
+    page.goto("#cameras")
+    page.get_by_role("button", name="New camera").click()
+    live = page.get_by_label("What these numbers come to")
+    expect(live).to_contain_text("Fill in image width")
+    fill(page, FRAME | LENS | {"Name": "d200"})
+    expected = served.ask("POST", "/cameras/preview", json.dumps(d200), JSON).json()
+    expect(live).to_contain_text(f"{expected['k_cam_px']:.4g}")
+    expect(live).to_contain_text(f"{expected['range_m']['far']:.3g}")
+    expect(live.get_by_role("img", name="Blur against distance")).to_be_visible()
+    live.get_by_text("As a table").click()
+    assert live.get_by_role("row").count() > 20
+    assert barriers(page) == []
+    page.get_by_role("button", name="Create camera").click()
+    expect(page.get_by_role("heading", name="d200")).to_be_visible()
+    assert read(served, "d200")["lens"] == {**d200["lens"], "k_r": 4.0}
+
+
+def test_a_fault_is_shown_at_its_field(page: Page, expected_errors: list[str]) -> None:
+    expected_errors.append("status of 422")
+    page.goto("#cameras")
+    page.get_by_role("button", name="New camera").click()
+    fill(page, FRAME | LENS | {"Name": "no name", "f-number": "wide"})
+    aperture = page.get_by_label("f-number")
+    expect(aperture).to_have_attribute("aria-invalid", "true")
+    expect(aperture).to_have_accessible_description("Input should be a valid number")
+    fill(page, {"f-number": "2,8"})
+    expect(aperture).to_have_attribute("aria-invalid", "false")
+    page.get_by_role("button", name="Create camera").click()
+    expect(page.get_by_label("Name", exact=True)).to_have_attribute("aria-invalid", "true")
+    fill(page, {"Focal length (mm)": "3500"})
+    expect(page.get_by_label("Focal length (mm)")).to_have_accessible_description(re.compile("cannot focus at 2 m"))
+
+
+def test_a_name_that_is_taken_is_told(
+    page: Page, served: Server, phone: dict[str, Any], expected_errors: list[str]
+) -> None:
+    expected_errors.append("status of 409")
+    served.add(phone)
+    page.goto("#cameras")
+    page.get_by_role("button", name="New camera").click()
+    page.get_by_label("k_cam", exact=True).check()
+    fill(page, FRAME | {"Name": phone["name"], "k_cam (px)": "2"})
+    page.get_by_role("button", name="Create camera").click()
+    expect(page.get_by_label("Name", exact=True)).to_have_accessible_description("This name is taken.")
+
+
+@pytest.mark.parametrize("keeps_mine", [True, False])
+def test_another_s_change_is_shown_and_one_chooses(
+    page: Page, served: Server, phone: dict[str, Any], expected_errors: list[str], keeps_mine: bool
+) -> None:
+    expected_errors.append("status of 412")
+    open_camera(page, served, phone)
+    page.get_by_role("button", name="Edit").click()
+    fill(page, {"Focus distance (m)": "3"})
+    path = f"/cameras/{phone['name']}"
+    served.ask("PUT", path, json.dumps(phone | {"k_cam_px": 1.7, "focus_distance_m": 2.5}), JSON)
+    page.get_by_role("button", name="Save as a new revision").click()
+    told = page.get_by_role("alert").filter(has_text="was changed while you edited it")
+    expect(told.get_by_role("row", name="focus_distance_m")).to_contain_text("2.53")
+    expect(told.get_by_role("row", name="k_cam_px")).to_contain_text("1.311.71.31")
+    assert read(served, phone["name"])["revision"] == 2
+    if keeps_mine:
+        page.get_by_role("button", name="Store mine as revision 3").click()
+        expect(page.get_by_text("revision 3").first).to_be_visible()
+        stored = read(served, phone["name"])
+        assert (stored["k_cam_px"], stored["focus_distance_m"]) == (1.31, 3)
+    else:
+        page.get_by_role("button", name="Take what is stored").click()
+        expect(page.get_by_label("Focus distance (m)")).to_have_value("2.5")
+        page.get_by_role("button", name="Save as a new revision").click()
+        expect(page.get_by_text("revision 3").first).to_be_visible()
+        assert read(served, phone["name"])["k_cam_px"] == 1.7
+
+
+def test_revisions_say_what_changed(page: Page, served: Server, phone: dict[str, Any]) -> None:
+    served.add(phone)
+    served.ask("PUT", f"/cameras/{phone['name']}", json.dumps(phone | {"k_cam_px": 1.7}), JSON)
+    page.goto(f"#cameras/{phone['name']}")
+    page.get_by_text("Revisions", exact=True).click()
+    expect(page.get_by_text("k_cam_px 1.31 → 1.7")).to_be_visible()
+
+
+def test_a_camera_is_deleted_after_a_question(page: Page, served: Server, phone: dict[str, Any]) -> None:
+    open_camera(page, served, phone)
+    page.get_by_role("button", name="Delete", exact=True).click()
+    dialog = page.get_by_role("dialog", name=f"Delete {phone['name']}?")
+    expect(dialog).to_be_visible()
+    page.keyboard.press("Escape")
+    expect(dialog).to_be_hidden()
+    assert read(served, phone["name"])["revision"] == 1
+    page.get_by_role("button", name="Delete", exact=True).click()
+    dialog.get_by_role("button", name=f"Delete {phone['name']}").click()
+    expect(page.get_by_role("button", name=phone["name"])).to_have_count(0)
+    assert served.ask("GET", f"/cameras/{phone['name']}").status == 404
+
+
+def test_what_is_exported_comes_back_after_it_is_shown(
+    page: Page,
+    served: Server,
+    d200: dict[str, Any],
+    phone: dict[str, Any],
+    tmp_path: Path,
+    expected_errors: list[str],
+    barriers: Callable[[Page], list[str]],
+) -> None:
+    expected_errors.append("status of 422")
+    served.add(d200)
+    served.add(phone)
+    page.goto("#cameras")
+    expect(page.get_by_role("button", name="d200")).to_be_visible()
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Export all").click()
+    exported = json.loads(download.value.path().read_text())["cameras"]
+    assert {camera["name"] for camera in exported} == {"d200", phone["name"]}
+    served.ask("DELETE", "/cameras/d200")
+    page.reload()
+    changed = {**exported[1], "k_cam_px": 2.5}
+    file = tmp_path / "cameras.json"
+    file.write_text(json.dumps([exported[0], changed, {**phone, "name": "bad", "gamma_px": -1}]))
+    page.get_by_label("Cameras to import").set_input_files(file)
+    plan = page.get_by_role("dialog", name="Import cameras")
+    expect(plan.get_by_role("row", name="d200")).to_contain_text("new")
+    expect(plan.get_by_role("row", name=phone["name"])).to_contain_text("k_cam_px: revision 1 becomes 2")
+    expect(plan.get_by_role("row", name="bad")).to_contain_text("refused gamma_px")
+    assert barriers(page) == []
+    assert served.ask("GET", "/cameras/d200").status == 404
+    plan.get_by_role("button", name="Import 2 cameras").click()
+    expect(plan.get_by_role("row", name=phone["name"])).to_contain_text("as revision 2")
+    plan.get_by_role("button", name="Close").click()
+    expect(page.get_by_role("button", name="d200")).to_be_visible()
+    assert read(served, phone["name"])["k_cam_px"] == 2.5
+
+
+def test_a_file_that_is_none_is_refused(page: Page, tmp_path: Path) -> None:
+    file = tmp_path / "cameras.json"
+    file.write_text("metres")
+    page.goto("#cameras")
+    page.get_by_label("Cameras to import").set_input_files(file)
+    expect(page.get_by_role("dialog")).to_contain_text("is no JSON")
+
+
+def test_a_photograph_fills_the_form_in(page: Page) -> None:
+    page.goto("#cameras")
+    page.get_by_role("button", name="New camera").click()
+    page.get_by_label("Fill in from a photograph it took").set_input_files(
+        Path(__file__).parents[2] / "docs/pictures/coffee.jpg"
+    )
+    expect(page.get_by_label("Image width (px)")).not_to_have_value("")
+    expect(page.get_by_text("focus_distance_m is needed")).to_be_visible()
+
+
+def test_cameras_fit_a_phone_and_the_dark(
+    page: Page, served: Server, d200: dict[str, Any], barriers: Callable[[Page], list[str]]
+) -> None:
+    page.set_viewport_size({"width": 360, "height": 740})
+    page.emulate_media(color_scheme="dark")
+    open_camera(page, served, d200)
+    expect(page.get_by_role("img", name="Blur against distance")).to_be_visible()
+    assert page.evaluate(OVERFLOW) <= 0
+    assert barriers(page) == []

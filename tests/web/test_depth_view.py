@@ -1,0 +1,468 @@
+"""The depth view in a real browser at a real service: what it shows are the service's own numbers."""
+
+import base64
+import io
+import json
+import shutil
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import matplotlib
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from playwright.sync_api import Browser, Locator, Page, Position, expect
+
+from model_export.served import Server, serving
+from tests.web.chromium import PROGRAMS
+from tests.web.watched import watched
+
+PHOTOGRAPH = Path(__file__).parents[2] / "docs" / "pictures" / "coffee.jpg"
+READY_MS = 60_000
+FORMATS = ("png", "npy", "npz", "tiff", "ply", "preview", "json")
+# no graphics card, and nothing in its place
+NO_GRAPHICS = ["--no-sandbox", "--disable-gpu", "--disable-software-rasterizer"]
+# what the console says of every answer that is no success
+REFUSED = "Failed to load resource"
+GIVE = """(place, {bytes, name, kind}) => {
+  const given = new DataTransfer();
+  const content = Uint8Array.from(atob(bytes), (letter) => letter.charCodeAt(0));
+  given.items.add(new File([content], name, {type: "image/jpeg"}));
+  const made = kind === "paste"
+    ? new ClipboardEvent(kind, {clipboardData: given, bubbles: true})
+    : new DragEvent(kind, {dataTransfer: given, bubbles: true, cancelable: true});
+  place.dispatchEvent(made);
+}"""
+PICTURE_COLOURS = """(canvas) => {
+  const {width, height} = canvas;
+  const copy = new OffscreenCanvas(width, height).getContext("2d");
+  copy.drawImage(canvas, 0, 0);
+  const {data} = copy.getImageData(0, 0, width, height);
+  const found = [];
+  for (let y = 3; y < height; y += 20) {
+    for (let x = 3; x < width; x += 20) {
+      const at = 4 * (y * width + x);
+      found.push([(x + 0.5) / width, (y + 0.5) / height, data[at], data[at + 1], data[at + 2]]);
+    }
+  }
+  return found;
+}"""
+FIRST_FRAME = """() => new Promise((done) => {
+  const start = performance.now();
+  new MutationObserver(() => done(performance.now() - start))
+    .observe(document.querySelector(".depth-cloud"), {attributes: true, attributeFilter: ["data-points"]});
+  document.getElementById("depth-tab-cloud").click();
+})"""
+
+Float = NDArray[np.float32]
+
+
+@pytest.fixture
+def opened(page: Page, served: Server, d200: dict[str, Any]) -> Page:
+    """The page of a service that knows the camera."""
+    served.add(d200)
+    page.set_default_timeout(READY_MS)
+    page.goto("")
+    return page
+
+
+@pytest.fixture
+def measured(opened: Page) -> Page:
+    """The page with a photograph's depth."""
+    choose(opened)
+    give(opened)
+    stage(opened)
+    return opened
+
+
+@pytest.fixture(scope="session")
+def maps(served: Server) -> Callable[..., Any]:
+    """Asks the same service for the photograph's maps."""
+
+    def ask(query: str = "") -> Any:
+        reply = served.ask("POST", f"/depth?camera=d200&format=npz{query}", PHOTOGRAPH.read_bytes())
+        return np.load(io.BytesIO(reply.body))
+
+    return ask
+
+
+@pytest.fixture
+def narrow(tmp_path: Path, d200: dict[str, Any]) -> Iterator[Server]:
+    """A service that works on one photograph and lets none wait."""
+    with serving(tmp_path / "data", settings={"CAMIND_WORKERS": "1", "CAMIND_QUEUE_SIZE": "0"}) as server:
+        server.add(d200)
+        yield server
+
+
+@pytest.fixture(scope="session")
+def twelve_megapixels() -> bytes:
+    """The photograph enlarged: as much work as a phone's."""
+    pixels = cv2.imread(str(PHOTOGRAPH))
+    assert pixels is not None
+    return cv2.imencode(".jpg", cv2.resize(pixels, (4256, 2850), interpolation=cv2.INTER_CUBIC))[1].tobytes()
+
+
+def choose(page: Page, camera: str = "d200") -> None:
+    page.get_by_role("combobox", name="Camera", exact=True).select_option(camera)
+
+
+def give(page: Page, photograph: bytes | None = None, kind: str = "drop") -> None:
+    """Drop or paste the photograph."""
+    data = base64.b64encode(photograph or PHOTOGRAPH.read_bytes()).decode()
+    page.locator(".depth").evaluate(GIVE, {"bytes": data, "name": "it's coffee.jpg", "kind": kind})
+
+
+def stage(page: Page) -> Locator:
+    """The picture, once it can be read."""
+    found = page.get_by_role("application", name="Depth of the photograph")
+    expect(found).to_be_visible(timeout=READY_MS)
+    expect(page.locator("[data-picture=depth]")).to_be_visible()
+    expect(page.get_by_role("progressbar")).to_have_count(0)
+    return found
+
+
+def place_of(picture: Locator, u: int, v: int) -> Position:
+    box = picture.bounding_box()
+    assert box is not None
+    return {"x": (u + 0.5) * box["width"] / 645, "y": (v + 0.5) * box["height"] / 432}
+
+
+def number_in(page: Page, name: str) -> float:
+    return float(page.locator(f"[data-value={name}]").inner_text().strip("± m"))
+
+
+def shown_pixel(page: Page) -> tuple[int, int]:
+    u, v = page.locator("[data-value=pixel]").inner_text().split(", ")
+    return int(u), int(v)
+
+
+def eventually(page: Page, is_so: Callable[[], bool]) -> None:
+    give_up = time.monotonic() + READY_MS / 1000
+    while not is_so():
+        assert time.monotonic() < give_up
+        page.wait_for_timeout(50)
+
+
+def tasks_ms(trace: bytes) -> Float:
+    """Processor time of each thing the page's main thread did without a pause, its waiting for one not counted."""
+    events = json.loads(trace)["traceEvents"]
+    main = {
+        (event["pid"], event["tid"])
+        for event in events
+        if event["name"] == "thread_name" and event["args"]["name"] == "CrRendererMain"
+    }
+    tasks = [
+        event["tdur"] / 1e3
+        for event in events
+        if event["name"].endswith("RunTask") and "tdur" in event and (event["pid"], event["tid"]) in main
+    ]
+    return np.array(tasks, np.float32)
+
+
+def test_three_actions_lead_to_metres_and_they_are_the_services(
+    page: Page, served: Server, d200: dict[str, Any], maps: Callable[..., Any]
+) -> None:
+    served.add(d200)
+    page.goto("")
+    choose(page)
+    give(page)
+    picture = stage(page)
+    known = maps()
+    for u, v in ((322, 216), (10, 420), (600, 31)):
+        picture.hover(position=place_of(picture, u, v))
+        expect(page.locator("[data-value=pixel]")).to_have_text(f"{u}, {v}")
+        assert number_in(page, "depth") == pytest.approx(known["depth_m"][v, u], abs=0.0006)
+        assert number_in(page, "sigma") == pytest.approx(known["sigma_m"][v, u], abs=0.0006)
+        blur = page.locator("[data-value=blur]").inner_text()
+        assert float(blur.removesuffix(" px")) == pytest.approx(known["blur_px"][v, u], abs=0.006)
+        other = known["depth_alt_m"][v, u]
+        told = page.locator("[data-value=other]").inner_text()
+        assert told.startswith(f"{other:.3f} m" if np.isfinite(other) else "no other")
+
+
+def test_two_points_have_the_distance_that_their_pixels_say(measured: Page, maps: Callable[..., Any]) -> None:
+    picture, known = stage(measured), maps()
+    ends = ((100, 300), (520, 180))
+    for u, v in ends:
+        picture.click(position=place_of(picture, u, v))
+    points = [np.linalg.inv(known["K"]) @ (u, v, 1) * known["depth_m"][v, u] for u, v in ends]
+    expect(measured.locator("[data-value=distance]")).to_be_visible()
+    assert number_in(measured, "distance") == pytest.approx(np.linalg.norm(points[0] - points[1]), abs=0.001)
+    # the error, by moving each depth a little
+    apart = points[0] - points[1]
+    shares = [
+        known["sigma_m"][v, u] * (apart @ point) / known["depth_m"][v, u] / np.linalg.norm(apart)
+        for (u, v), point in zip(ends, points, strict=True)
+    ]
+    assert number_in(measured, "distance-sigma") == pytest.approx(np.hypot(*shares), abs=0.001)
+    expect(measured.locator("[data-label=distance]")).to_be_visible()
+    picture.press("Escape")
+    expect(measured.locator("[data-value=distance]")).to_have_count(0)
+
+
+def test_keys_alone_read_and_measure(measured: Page, maps: Callable[..., Any]) -> None:
+    picture, known = stage(measured), maps()
+    picture.focus()
+    picture.press("ArrowRight")
+    for key in ("ArrowRight", "ArrowDown", "Enter", "Shift+ArrowLeft"):
+        before = measured.locator("[data-value=pixel]").inner_text()
+        picture.press(key)
+        if key != "Enter":
+            expect(measured.locator("[data-value=pixel]")).not_to_have_text(before)
+    u, v = shown_pixel(measured)
+    assert (u, v) == (323 - 33, 217)
+    assert number_in(measured, "depth") == pytest.approx(known["depth_m"][v, u], abs=0.0006)
+    expect(measured.get_by_role("status")).to_contain_text(f"{known['depth_m'][v, u]:.3f} metres")
+    picture.press("Enter")
+    expect(measured.locator("[data-value=distance]")).to_be_visible()
+
+
+def test_colours_are_those_of_the_metres(measured: Page, maps: Callable[..., Any]) -> None:
+    depth_m = maps()["depth_m"]
+    near_m, far_m = 1.0, 4.0
+    measured.get_by_role("combobox", name="Map").select_option("grey")
+    measured.get_by_label("Dot either side").uncheck()
+    for end, value in (("Far", far_m), ("Near", near_m)):
+        box = measured.get_by_label(f"{end} end of the colours, metres")
+        box.fill(str(value))
+        box.press("Enter")
+    place = np.clip(np.log(depth_m / near_m) / np.log(far_m / near_m), 0, 1)
+    grey = np.rint(0x14 + (0xFF - 0x14) * (1 - place))
+
+    def is_painted() -> bool:
+        x, y, *colours = np.array(measured.locator("[data-picture=depth]").evaluate(PICTURE_COLOURS)).T
+        expected = grey[(y * 432).astype(int), (x * 645).astype(int)]
+        return all(np.abs(colour - expected).max() <= 1 for colour in colours)
+
+    eventually(measured, is_painted)
+    expect(measured.locator(".depth-ticks")).to_contain_text("2")
+
+
+def test_colour_maps_are_those_that_others_draw(opened: Page) -> None:
+    for name in ("cividis", "viridis", "turbo"):
+        ours = opened.evaluate("(name) => import('./web/colours.js').then((it) => [...it.colourTable(name)])", name)
+        theirs = matplotlib.colormaps[name](np.arange(256), bytes=True)[:, :3]
+        assert np.abs(np.array(ours).reshape(256, 3) - theirs).max() <= 7
+
+
+def test_the_divider_uncovers_the_photograph(measured: Page) -> None:
+    slider = measured.get_by_role("slider", name="Part of the picture that shows the photograph")
+    stage(measured)
+    box = stage(measured).bounding_box()
+    assert box is not None
+    middle = box["y"] + box["height"] / 2
+    measured.mouse.move(box["x"] + 2, middle)
+    measured.mouse.down()
+    measured.mouse.move(box["x"] + box["width"] / 2, middle, steps=3)
+    measured.mouse.up()
+    expect(slider).to_have_value("50")
+    slider.press("End")
+    expect(measured.locator(".depth-over")).to_have_css("clip-path", "inset(0px 0px 0px 100%)")
+    expect(measured.get_by_role("button", name="Clear points")).to_have_count(0)
+
+
+def test_another_side_or_focus_is_read_again(measured: Page, maps: Callable[..., Any]) -> None:
+    side = measured.get_by_role("combobox", name="Side of the plane in focus")
+    focus = measured.get_by_role("spinbutton", name="Focus distance of this shot")
+
+    def refocus() -> None:
+        focus.fill("1.5")
+        focus.press("Enter")
+
+    def change_side() -> None:
+        side.select_option("near")
+
+    for act, query in ((change_side, "&side=near"), (refocus, "&side=near&focus_distance_m=1.5")):
+        with measured.expect_response(lambda answer: "/depth?" in answer.url):
+            act()
+        picture = stage(measured)
+        picture.hover(position=place_of(picture, 50, 50))
+        picture.hover(position=place_of(picture, 322, 216))
+        expect(measured.locator("[data-value=pixel]")).to_have_text("322, 216")
+        assert number_in(measured, "depth") == pytest.approx(maps(query)["depth_m"][216, 322], abs=0.0006)
+
+
+def test_points_in_space_are_drawn_turned_and_counted(measured: Page, maps: Callable[..., Any]) -> None:
+    measured.get_by_role("tab", name="3D").click()
+    cloud = measured.get_by_role("application", name="Points in space")
+    expect(cloud).to_have_attribute("data-points", str(int(maps()["valid"].sum())), timeout=READY_MS)
+
+    def drawn() -> Float:
+        pixels = cv2.imdecode(np.frombuffer(cloud.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+        assert pixels is not None
+        return pixels.astype(np.float32)
+
+    eventually(measured, lambda: drawn().std() > 5)
+    start = drawn()
+    cloud.press("ArrowRight")
+    eventually(measured, lambda: np.abs(drawn() - start).mean() > 1)
+    cloud.press("0")
+    eventually(measured, lambda: np.abs(drawn() - start).mean() < 0.1)
+
+
+def test_nothing_keeps_people_out(measured: Page, barriers: Callable[[Page], list[str]]) -> None:
+    picture = stage(measured)
+    for u in (200, 400):
+        picture.click(position=place_of(picture, u, 216))
+    measured.get_by_role("button", name="Copy as curl").click()
+    measured.get_by_text("The service took").click()
+    schemes: tuple[Literal["light", "dark"], ...] = ("light", "dark")
+    for scheme in schemes:
+        measured.emulate_media(color_scheme=scheme)
+        assert barriers(measured) == [], scheme
+    measured.set_viewport_size({"width": 360, "height": 640})
+    assert measured.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
+    measured.get_by_role("tab", name="3D").click()
+    assert barriers(measured) == []
+
+
+def test_without_webgl_the_page_says_so(served: Server, d200: dict[str, Any], browser: Browser) -> None:
+    served.add(d200)
+    program = next(filter(None, map(shutil.which, PROGRAMS)))
+    blind = browser.browser_type.launch(executable_path=program, args=NO_GRAPHICS)
+    with closing(blind), watched(blind, served.url, []) as page:
+        page.goto("")
+        choose(page)
+        give(page)
+        stage(page)
+        page.get_by_role("tab", name="3D").click()
+        expect(page.get_by_text("This browser has no WebGL2")).to_be_visible(timeout=READY_MS)
+
+
+def test_without_a_focal_length_there_are_depths_but_no_space(
+    opened: Page, served: Server, phone: dict[str, Any]
+) -> None:
+    served.add({**phone, "name": "blurred", "image_width_px": 645, "image_height_px": 432})
+    opened.reload()
+    choose(opened, "blurred")
+    give(opened, kind="paste")
+    stage(opened)
+    expect(opened.get_by_text("Needs the camera's focal length")).to_be_visible()
+    opened.get_by_role("tab", name="3D").click()
+    expect(opened.get_by_text("Points in space need the camera's focal length")).to_be_visible()
+
+
+@pytest.mark.parametrize("language", ["curl", "Python"])
+def test_what_is_copied_runs_as_pasted(measured: Page, maps: Callable[..., Any], tmp_path: Path, language: str) -> None:
+    measured.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    measured.get_by_role("combobox", name="Format").select_option("npy")
+    measured.get_by_role("button", name=f"Copy as {language}").click()
+    expect(measured.get_by_text("Copied. To be run")).to_be_visible()
+    pasted = measured.evaluate("navigator.clipboard.readText()")
+    (tmp_path / "it's coffee.jpg").write_bytes(PHOTOGRAPH.read_bytes())
+    shell = ["sh", "-e"] if language == "curl" else ["python3", "-"]
+    subprocess.run(shell, input=pasted, text=True, cwd=tmp_path, check=True, capture_output=True)
+    np.testing.assert_array_equal(np.load(tmp_path / "it's coffee-depth.npy"), maps()["depth_m"])
+
+
+def test_every_format_can_be_taken_along(measured: Page, served: Server) -> None:
+    for form in FORMATS:
+        measured.get_by_role("combobox", name="Format").select_option(form)
+        with measured.expect_download() as downloading:
+            measured.get_by_role("button", name="Download").click()
+        assert downloading.value.suggested_filename.startswith("it's coffee-depth.")
+        reply = served.ask("POST", f"/depth?camera=d200&format={form}", PHOTOGRAPH.read_bytes())
+        assert downloading.value.path().read_bytes() == reply.body
+
+
+def test_a_photograph_that_is_no_frame_of_the_camera_drafts_its_own(
+    opened: Page, served: Server, expected_errors: list[str]
+) -> None:
+    expected_errors.append(REFUSED)
+    pixels = cv2.imread(str(PHOTOGRAPH))
+    assert pixels is not None
+    square = cv2.imencode(".jpg", pixels[:320, :320])[1].tobytes()
+    choose(opened)
+    give(opened, square)
+    expect(opened.get_by_role("alert")).to_contain_text("320x320 pixels upright, the camera 645x432")
+    expect(opened.get_by_role("combobox", name="Camera", exact=True)).to_have_attribute("aria-invalid", "true")
+    opened.get_by_role("button", name="Draft a camera").click()
+    form = opened.get_by_role("form", name="A camera from this photograph")
+    expect(form).to_contain_text("focus_distance_m is needed")
+    for label, value in (
+        ("Name", "squared"),
+        ("Focus distance", "2"),
+        ("Real focal length", "35"),
+        ("f-number", "2.8"),
+        ("Pixel pitch", "36"),
+    ):
+        form.get_by_label(label).fill(value)
+    form.get_by_role("button", name="Store the camera").click()
+    stage(opened)
+    assert served.ask("GET", "/cameras/squared").json()["lens"]["focal_length_mm"] == 35
+    expect(opened.get_by_role("combobox", name="Camera", exact=True)).to_have_value("squared")
+
+
+def test_without_a_camera_the_photograph_is_asked_for_one(opened: Page, barriers: Callable[[Page], list[str]]) -> None:
+    give(opened)
+    expect(opened.get_by_role("form", name="A camera from this photograph")).to_be_visible()
+    assert barriers(opened) == []
+    choose(opened)
+    stage(opened)
+    expect(opened.get_by_role("form")).to_have_count(0)
+
+
+def test_a_full_service_says_when_and_a_cancelled_photograph_makes_room(
+    narrow: Server, browser: Browser, twelve_megapixels: bytes
+) -> None:
+    with watched(browser, narrow.url, []) as first, watched(browser, narrow.url, [REFUSED]) as second:
+        for page in (first, second):
+            page.goto("")
+            choose(page)
+        give(first, twelve_megapixels)
+        expect(first.get_by_text("reading the blur")).to_be_visible()
+        narrow.poll(lambda: "camind_depth_slots_in_use 1" in narrow.ask("GET", "/metrics").body.decode() or None)
+        give(second)
+        expect(second.get_by_role("alert")).to_contain_text("try again later")
+        expect(second.get_by_role("button", name="Try again")).to_contain_text("in")
+        first.get_by_role("button", name="Cancel").click()
+        expect(first.get_by_role("alert")).to_contain_text("Cancelled")
+        narrow.poll(lambda: "camind_depth_slots_in_use 0" in narrow.ask("GET", "/metrics").body.decode() or None)
+        second.get_by_role("button", name="Try again").click()
+        stage(second)
+        expect(second.get_by_role("alert")).to_have_count(0)
+
+
+def test_a_service_that_ends_meanwhile_is_told_of(narrow: Server, browser: Browser, twelve_megapixels: bytes) -> None:
+    with watched(browser, narrow.url, [REFUSED]) as page:
+        page.goto("")
+        choose(page)
+        give(page, twelve_megapixels)
+        expect(page.get_by_text("reading the blur")).to_be_visible()
+        narrow.process.kill()
+        expect(page.get_by_role("alert")).to_contain_text("The service does not answer.")
+        expect(page.get_by_role("button", name="Try again")).to_be_visible()
+
+
+@pytest.mark.timeout(900)
+def test_the_page_stays_fluid(
+    opened: Page, browser: Browser, is_soak: bool, twelve_megapixels: bytes, tmp_path: Path
+) -> None:
+    """The long version: 12 megapixels."""
+    photograph = tmp_path / "photograph.jpg"
+    photograph.write_bytes(twelve_megapixels if is_soak else PHOTOGRAPH.read_bytes())
+    opened.set_default_timeout(5 * READY_MS)
+    choose(opened)
+    browser.start_tracing(page=opened, categories=["toplevel", "disabled-by-default-devtools.timeline"])
+    # a dropped one would be made in the page, which takes the page's time
+    opened.locator(".depth input[type=file]").first.set_input_files(photograph)
+    picture = opened.get_by_role("application", name="Depth of the photograph")
+    picture.wait_for()
+    for step in range(10):
+        picture.hover(position={"x": 100 + 20 * step, "y": 100})
+    bound = opened.get_by_role("slider", name="Near end of the colours")
+    for step in range(0, 500, 100):
+        bound.fill(str(step))
+    expect(opened.get_by_role("tab", name="3D")).to_be_visible()
+    frame_ms = opened.evaluate(FIRST_FRAME)
+    tasks = tasks_ms(browser.stop_tracing())
+    blocking_ms = np.maximum(tasks - 50, 0).sum()
+    print(f"main thread blocked {blocking_ms:.0f} ms, longest task {tasks.max():.0f} ms; 3D after {frame_ms:.0f} ms")  # noqa: T201
+    assert blocking_ms < 300
+    # 0.5 s where nothing else runs
+    assert frame_ms < 15_000

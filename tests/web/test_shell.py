@@ -1,0 +1,238 @@
+"""The page's frame in a real browser: tabs, keyboard, API key, accessibility, and a service that goes away."""
+
+import re
+import signal
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from model_export.served import Server, serving
+from service.config import DATABASE_FILE
+from service.principal import EVERYDAY, SCOPES, Scope
+from service.storage import schema
+from service.storage.engine import open_engine
+from service.storage.keys import Keys
+from tests.web.watched import watched
+
+ROOT = Path(__file__).parents[2]
+TABS = ("depth", "cameras", "calibrate", "status")
+QUOTA = 40
+REFUSED = "status of 401"
+OVERFLOW = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+
+
+@dataclass(frozen=True)
+class Keyed:
+    """A service that wants keys, and a way to make them."""
+
+    server: Server
+    keys: Keys
+
+    def key(self, *scopes: Scope) -> str:
+        return self.keys.create("page", "page", scopes or EVERYDAY)[1]
+
+
+@pytest.fixture(scope="module")
+def keyed(tmp_path_factory: pytest.TempPathFactory, tiny_model_dir: Path) -> Iterator[Keyed]:
+    data_dir = tmp_path_factory.mktemp("keyed") / "data"
+    data_dir.mkdir()
+    engine = open_engine(f"sqlite:///{data_dir / DATABASE_FILE}")
+    schema.upgrade(engine)
+    keys = Keys(engine)
+    keys.create("first", "nobody")
+    wanted = {"CAMIND_API_KEYS": "on", "CAMIND_KEY_REQUESTS_PER_MINUTE": str(QUOTA)}
+    with serving(data_dir, "--model", tiny_model_dir, settings=wanted) as server:
+        yield Keyed(server, keys)
+    engine.dispose()
+
+
+def selected(page: Page, name: str) -> None:
+    expect(page.get_by_role("tab", name=name)).to_have_attribute("aria-selected", "true")
+    expect(page.get_by_role("tabpanel")).to_have_count(1)
+    expect(page.get_by_role("tabpanel", name=name)).to_be_visible()
+
+
+def give_key(page: Page, key: str) -> None:
+    page.get_by_label("Key", exact=True).fill(key)
+    page.get_by_role("button", name="Use this key").click()
+
+
+def test_the_page_opens_on_the_depth_view(page: Page) -> None:
+    page.goto("")
+    selected(page, "Depth")
+
+
+def test_tabs_are_addresses(page: Page) -> None:
+    page.goto("#cameras")
+    selected(page, "Cameras")
+    page.get_by_role("tab", name="Status").click()
+    assert page.url.endswith("#status")
+    selected(page, "Status")
+    page.go_back()
+    selected(page, "Cameras")
+    page.goto("#nowhere/%ff")
+    selected(page, "Depth")
+
+
+def test_tabs_work_from_the_keyboard_and_show_where_it_is(page: Page) -> None:
+    page.goto("")
+    page.keyboard.press("Tab")
+    page.keyboard.press("Tab")
+    for key, name in (
+        ("ArrowRight", "Cameras"),
+        ("End", "Status"),
+        ("ArrowRight", "Depth"),
+        ("ArrowLeft", "Status"),
+        ("Home", "Depth"),
+    ):
+        page.keyboard.press(key)
+        selected(page, name)
+        tab = page.get_by_role("tab", name=name)
+        expect(tab).to_be_focused()
+        outline = tab.evaluate("(element) => getComputedStyle(element).outline")
+        assert re.search(r"solid 2px|2px solid", outline), outline
+    # one stop for all tabs, then on into the view
+    page.keyboard.press("Tab")
+    expect(page.get_by_role("tab", name="Depth")).not_to_be_focused()
+
+
+@pytest.mark.parametrize("tab", TABS)
+def test_nothing_keeps_people_out(page: Page, barriers: Callable[[Page], list[str]], tab: str) -> None:
+    page.goto(f"#{tab}")
+    page.wait_for_load_state("networkidle")
+    schemes: tuple[Literal["light", "dark"], ...] = ("light", "dark")
+    for scheme in schemes:
+        page.emulate_media(color_scheme=scheme)
+        assert barriers(page) == [], scheme
+    page.set_viewport_size({"width": 360, "height": 640})
+    assert page.evaluate(OVERFLOW) <= 0
+
+
+def test_status_tells_what_the_service_tells(page: Page, served: Server) -> None:
+    manifest = served.ask("GET", "/model").json()["manifest"]
+    page.goto("#status")
+    expect(page.get_by_text("Ready", exact=True)).to_be_visible()
+    expect(page.get_by_role("status")).to_contain_text("The service is ready.")
+    row = page.get_by_role("row", name="plane 1 m")
+    expect(row.get_by_role("cell").first).to_have_text(f"{manifest['scores']['plane 1 m.abs_rel']:.3f}")
+    expect(page.get_by_role("region", name="Queue")).to_contain_text("0 of 16 waiting")
+    before = page.get_by_role("region", name="Latency").inner_text()
+    served.add({"name": "status", "image_width_px": 600, "image_height_px": 400, "focus_distance_m": 1, "k_cam_px": 4})
+    photograph = (ROOT / "docs" / "pictures" / "coffee.jpg").read_bytes()
+    assert served.ask("POST", "/depth?camera=status", photograph, {"Content-Type": "image/jpeg"}).status == 200
+    # it looks again by itself
+    expect(page.get_by_role("region", name="Latency")).not_to_have_text(before)
+    expect(page.get_by_role("row", name="Depth graph")).to_be_visible()
+    served.ask("DELETE", "/cameras/status")
+
+
+def test_a_key_is_asked_for_once_and_kept_for_the_tab(browser: Browser, keyed: Keyed) -> None:
+    with watched(browser, keyed.server.url, [REFUSED]) as page:
+        page.goto("#cameras")
+        dialog = page.get_by_role("dialog", name="API key")
+        expect(dialog).to_be_visible()
+        expect(page.get_by_label("Key", exact=True)).to_be_focused()
+        give_key(page, "no key")
+        expect(dialog).to_contain_text("This is no API key")
+        give_key(page, f"camind_0123456789ab_{'x' * 43}")
+        expect(dialog).to_contain_text("unknown, revoked or expired")
+        give_key(page, keyed.key())
+        expect(dialog).to_be_hidden()
+        expect(page.get_by_role("alert").filter(visible=True)).to_have_count(0)
+        with page.expect_response(lambda answer: "/cameras?" in answer.url) as answered:
+            page.reload()
+        assert answered.value.status == 200
+        expect(dialog).to_be_hidden()
+        assert page.evaluate("localStorage.length + document.cookie.length") == 0
+        another = page.context.new_page()
+        another.goto(keyed.server.url)
+        expect(another.get_by_role("dialog", name="API key")).to_be_visible()
+        page.get_by_role("button", name="Forget API key").click()
+        expect(dialog).to_be_visible()
+
+
+def test_without_a_key_the_page_says_what_it_lacks(
+    browser: Browser, keyed: Keyed, barriers: Callable[[Page], list[str]]
+) -> None:
+    with watched(browser, keyed.server.url, [REFUSED]) as page:
+        page.goto("")
+        expect(page.get_by_role("dialog", name="API key")).to_be_visible()
+        assert barriers(page) == []
+        page.keyboard.press("Escape")
+        expect(page.get_by_role("dialog", name="API key")).to_be_hidden()
+        expect(page.get_by_role("alert").filter(has_text="API key needed")).to_be_visible()
+        assert barriers(page) == []
+        page.get_by_role("button", name="Try again").first.click()
+        give_key(page, keyed.key())
+        expect(page.get_by_role("alert").filter(visible=True)).to_have_count(0)
+
+
+@pytest.mark.parametrize(("scopes", "seen"), [(EVERYDAY, "scope admin"), (SCOPES, "waiting")])
+def test_status_shows_what_the_key_may_see(
+    browser: Browser, keyed: Keyed, scopes: tuple[Scope, ...], seen: str
+) -> None:
+    with watched(browser, keyed.server.url, [REFUSED, "status of 403"]) as page:
+        page.goto("")
+        give_key(page, keyed.key(*scopes))
+        page.get_by_role("tab", name="Status").click()
+        expect(page.get_by_role("region", name="Queue")).to_contain_text(seen)
+        with page.expect_download() as saved:
+            page.get_by_role("button", name="Download the API as OpenAPI").click()
+        assert '"openapi"' in saved.value.path().read_text()
+
+
+def test_a_quota_says_when_to_come_back(browser: Browser, keyed: Keyed) -> None:
+    key = keyed.key()
+    for _ in range(QUOTA):
+        keyed.server.ask("GET", "/model", headers={"Authorization": f"Bearer {key}"})
+    with watched(browser, keyed.server.url, [REFUSED, "status of 429"]) as page:
+        page.goto("")
+        give_key(page, key)
+        problem = page.get_by_role("alert").filter(has_text="Quota exceeded").first
+        expect(problem).to_contain_text(re.compile(r"Try again \(in \d+ s\)"))
+        expect(problem).to_contain_text("Request ")
+
+
+def test_a_service_that_stops_is_told_apart_from_one_that_refuses(
+    browser: Browser, tmp_path: Path, tiny_model_dir: Path
+) -> None:
+    with (
+        serving(tmp_path / "data", "--model", tiny_model_dir) as server,
+        watched(browser, server.url, ["ERR_CONNECTION_REFUSED", "status of 503"]) as page,
+    ):
+        page.goto("#status")
+        expect(page.get_by_text("Ready", exact=True)).to_be_visible()
+        server.stop(signal.SIGTERM)
+        expect(page.get_by_text("No answer", exact=True)).to_be_visible(timeout=20_000)
+        expect(page.get_by_role("alert").filter(visible=True)).to_contain_text("The service does not answer.")
+        expect(page.get_by_role("status")).to_contain_text("The service is not ready.")
+
+
+def test_the_api_module_tells_problems_apart(page: Page, expected_errors: list[str]) -> None:
+    expected_errors.append("status of 422")
+    page.goto("")
+    told = page.evaluate(
+        """async () => {
+          const { Problem, getJson, upload } = await import("/web/api.js");
+          const headers = { "Content-Type": "application/json" };
+          const fractions = [];
+          const body = JSON.stringify({ name: "a", nonsense: "x".repeat(15000) });
+          const onProgress = (fraction) => fractions.push(fraction);
+          const refused = await upload("cameras", { headers, body, onProgress }).catch((error) => error);
+          const stop = new AbortController();
+          const aborted = getJson("model", { signal: stop.signal }).catch((error) => error.name);
+          stop.abort();
+          const isProblem = refused instanceof Problem;
+          return { ...refused, isProblem, fractions, aborted: await aborted };
+        }"""
+    )
+    assert told["isProblem"]
+    assert (told["status"], told["title"]) == (422, "Invalid request")
+    assert {"#/nonsense", "#/image_width_px"} <= {fault["pointer"] for fault in told["errors"]}
+    assert told["requestId"]
+    assert told["fractions"][-1] == 1
+    assert told["aborted"] == "AbortError"
