@@ -61,7 +61,7 @@ def train(
     steps: Annotated[int, typer.Option(min=1, help="batches in the whole run")] = 12_000,
     seed: Annotated[int, typer.Option(min=0, help="the same seed is the same run")] = 1,
     weights: Annotated[
-        Path | None, typer.Option(help="checkpoint whose weights a new run begins with", exists=True, dir_okay=False)
+        Path | None, typer.Option(help="checkpoint or model folder whose weights a new run begins with", exists=True)
     ] = None,
     learning_rate: Annotated[float, typer.Option(min=1e-6, max=1e-2, help="before it falls")] = 1e-3,
     workers: Annotated[int, typer.Option(min=0, max=64, help="processes that draw scenes")] = 1,

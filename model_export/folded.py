@@ -45,9 +45,9 @@ def _fold(unet: UNet) -> None:
 def _folded(block: nn.Module) -> nn.Module:
     first, *rest = _without_norms(list(block.children()))
     if isinstance(block, Stem):
-        return _FoldedStem(_as(nn.Conv2d, first), rest)
+        return FoldedStem(_as(nn.Conv2d, first), rest)
     if isinstance(block, Joining):
-        return _FoldedJoining(block.coarse, _as(nn.Conv2d, first), rest)
+        return FoldedJoining(block.coarse, _as(nn.Conv2d, first), rest)
     return nn.Sequential(first, *rest)
 
 
@@ -74,7 +74,7 @@ def _convolution(weight: Tensor, bias: Tensor | None, stride: int = 1, padding: 
     return made
 
 
-class _FoldedStem(nn.Module):
+class FoldedStem(nn.Module):
     def __init__(self, first: nn.Conv2d, rest: list[nn.Module]) -> None:
         super().__init__()
         cells = 4 * 3
@@ -91,7 +91,7 @@ class _FoldedStem(nn.Module):
         return out
 
 
-class _FoldedJoining(nn.Module):
+class FoldedJoining(nn.Module):
     def __init__(self, coarse: int, first: nn.Conv2d, rest: list[nn.Module]) -> None:
         super().__init__()
         self.quarters = nn.ModuleList(_convolution(w, None, padding=0) for w in _quarters(first.weight[:, :coarse]))

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from model_export.config import SceneConfig, TrainConfig
 from model_export.losses import Batch, run_pair, total_loss
 from model_export.networks import Pair, make_pair
 from model_export.progress import progress_bar
+from model_export.restored import restored, spread_norms
 from model_export.scenes import Sample, draw_sample
 from model_export.textures import load_photographs
 
@@ -212,11 +214,19 @@ class Trainer:
             self.optimizer.load_state_dict(resume.optimizer)
             self.step = resume.step
 
-    def begin_with(self, other: Checkpoint) -> None:
-        """Take over another run's weights, and nothing else of it."""
-        if other.config.kind != self.config.kind:
-            raise ValueError(f"weights of a {other.config.kind} pair do not fit a {self.config.kind} pair")
-        self.modules.load_state_dict(other.modules)
+    def begin_with(self, weights: Path, batches: Iterable[Batch]) -> None:
+        """Take over another run's weights, and nothing else of it: a checkpoint's or a model folder's.
+
+        A folder's batch norms are folded away; they are set to what these batches show them.
+        """
+        if weights.is_dir():
+            pair = restored(weights)
+            spread_norms(pair, (partial(run_pair, pair, batch) for batch in batches))
+        else:
+            pair = Checkpoint.load(weights).pair()
+        if pair.kind != self.config.kind:
+            raise ValueError(f"weights of a {pair.kind} pair do not fit a {self.config.kind} pair")
+        self.modules.load_state_dict(pair.modules().state_dict())
 
     def autocast(self) -> torch.autocast:
         """bfloat16 where the hardware computes it; emulated on an older processor it is ten times slower."""
@@ -300,8 +310,8 @@ def train(
 ) -> Path:
     """Train in folder ``run``, going on from its checkpoint if there is one; the path of the last checkpoint.
 
-    A run without a checkpoint begins with the weights of the checkpoint ``weights``, or with random ones. Raises
-    ``ValueError`` for weights of another kind.
+    A run without a checkpoint begins with the ``weights`` of a checkpoint or a model folder, or with random ones.
+    Raises ``ValueError`` for weights of another kind.
     """
     console = console or Console(stderr=True)
     photographs = load_photographs(textures)
@@ -309,13 +319,13 @@ def train(
     path = run / "checkpoint.pt"
     resume = Checkpoint.load(path) if path.exists() else None
     trainer = Trainer(config, device, resume)
-    if resume is None and weights is not None:
-        trainer.begin_with(Checkpoint.load(weights))
     pool = Pool(config, photographs, trainer.step, workers)
     test = held_out(config.scenes, photographs, 2 * config.batch)
     with progress_bar(console) as progress:
         for _ in progress.track(pool.fill(), total=pool.missing, description="scenes"):
             pass
+        if resume is None and weights is not None:
+            trainer.begin_with(weights, (pool.batch(config.steps + i) for i in range(config.settle_batches)))
         task = progress.add_task("training", total=config.steps, completed=trainer.step)
         recent: deque[dict[str, float]] = deque(maxlen=config.checkpoint_every)
         pace = Pace()

@@ -172,6 +172,19 @@ export async function getJson(path, options = {}) {
   }
 }
 
+/** @returns {Promise<any[]>} the cameras as they are now, by name */
+export async function everyCamera() {
+  const found = [];
+  let cursor = null;
+  do {
+    const after = cursor === null ? "" : `&cursor=${encodeURIComponent(cursor)}`;
+    const page = await getJson(`cameras?limit=200${after}`);
+    found.push(...page.items);
+    cursor = page.next_cursor;
+  } while (cursor !== null);
+  return found;
+}
+
 /**
  * Send a body with progress.
  *

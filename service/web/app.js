@@ -1,6 +1,6 @@
 /** The page's frame: tabs by location hash, the cameras that all of them use, the API key, and what is said aloud. */
 
-import { KEY_CHANGED, Problem, forgetKey, getJson, problemOf, storedKey } from "./api.js";
+import { KEY_CHANGED, Problem, everyCamera, forgetKey, problemOf, storedKey } from "./api.js";
 import { CalibrateView } from "./calibrate.js";
 import { CamerasView } from "./cameras.js";
 import { DepthView } from "./depth.js";
@@ -30,7 +30,6 @@ const TABS = [
   { tab: "calibrate", title: "Calibrate", View: CalibrateView },
   { tab: "status", title: "Status", View: StatusView },
 ];
-const CAMERAS_A_PAGE = 200;
 
 /** @returns {{tab: Tab, camera: string | null}} from `#tab` or `#tab/camera` */
 function readHash() {
@@ -56,18 +55,6 @@ function useHash() {
     return () => removeEventListener("hashchange", read);
   }, []);
   return place;
-}
-
-async function everyCamera() {
-  const found = [];
-  let cursor = null;
-  do {
-    const after = cursor === null ? "" : `&cursor=${encodeURIComponent(cursor)}`;
-    const page = await getJson(`cameras?limit=${CAMERAS_A_PAGE}${after}`);
-    found.push(...page.items);
-    cursor = page.next_cursor;
-  } while (cursor !== null);
-  return found;
 }
 
 function App() {

@@ -1,6 +1,6 @@
 /** Cameras as files: all or one out, and back in after it is shown what that would do. */
 
-import { Problem, problemOf, request } from "./api.js";
+import { Problem, everyCamera, problemOf, request } from "./api.js";
 import { differences, specsOf } from "./camera_specs.js";
 import { counted } from "./numbers.js";
 import { save } from "./save.js";
@@ -20,9 +20,9 @@ export function exportCameras(cameras, name) {
 }
 
 /**
- * @param {{file: File, cameras: any[], onClose: (stored: number) => void}} props
+ * @param {{file: File, onClose: (stored: number) => void}} props
  */
-export function ImportDialog({ file, cameras, onClose }) {
+export function ImportDialog({ file, onClose }) {
   const dialog = useRef(/** @type {HTMLDialogElement | null} */ (null));
   const [steps, setSteps] = useState(/** @type {Step[] | null} */ (null));
   const [fault, setFault] = useState("");
@@ -32,7 +32,7 @@ export function ImportDialog({ file, cameras, onClose }) {
 
   useEffect(() => {
     dialog.current?.showModal();
-    planOf(file, cameras).then(setSteps, (error) => setFault(error.detail ?? error.message));
+    planOf(file).then(setSteps, (error) => setFault(error.detail ?? error.message));
   }, []);
 
   async function carryOut() {
@@ -83,10 +83,9 @@ const TONES = { create: "good", update: "warn", nothing: "", refuse: "bad", done
 
 /**
  * @param {File} file
- * @param {any[]} cameras that are there
  * @returns {Promise<Step[]>}
  */
-async function planOf(file, cameras) {
+async function planOf(file) {
   /** @type {any} */
   let content;
   try {
@@ -96,6 +95,7 @@ async function planOf(file, cameras) {
   }
   const listed = Array.isArray(content) ? content : (content?.cameras ?? content?.items ?? [content]);
   if (!Array.isArray(listed) || listed.length === 0) throw new Error(`There is no camera in ${file.name}.`);
+  const cameras = await everyCamera();
   const names = listed.map((one) => one?.name);
   const steps = [];
   for (const [place, one] of listed.entries()) {
@@ -107,7 +107,7 @@ async function planOf(file, cameras) {
 
 /**
  * @param {any} given
- * @param {any[]} cameras
+ * @param {any[]} cameras that are there
  * @returns {Promise<Step>}
  */
 async function planned(given, cameras) {

@@ -126,7 +126,6 @@ export function CamerasView({ shown, cameras, camera, reloadCameras, go, announc
       ${file &&
       html`<${ImportDialog}
         file=${file}
-        cameras=${cameras ?? []}
         onClose=${(/** @type {number} */ stored) => {
           setFile(null);
           if (stored > 0) changed(null, `${counted(stored, "camera is", "cameras are")} imported.`);

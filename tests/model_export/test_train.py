@@ -12,10 +12,13 @@ import torch
 from rich.console import Console
 
 from model_export.config import SceneConfig, TrainConfig
+from model_export.folded import folded
+from model_export.restored import restored
 from model_export.scenes import draw_sample
 from model_export.textures import load_photographs
 from model_export.train import Checkpoint, Pool, Trainer, collate, learning_rate, settling_step, train
 
+SHIPPED = Path(__file__).parents[2] / "service" / "models"
 SCENES = SceneConfig(size_px=32, margin_px=8)
 CONFIG = TrainConfig(
     steps=6, batch=2, pool=8, fresh_per_step=1, checkpoint_every=3, settle_batches=3, warmup_steps=2, scenes=SCENES
@@ -69,11 +72,19 @@ def test_the_mean_of_two_checkpoints_lies_between_them(textures: Path, tmp_path:
 def test_a_new_run_begins_with_the_weights_it_is_told(textures: Path, tmp_path: Path) -> None:
     first, _ = run(CONFIG, textures, tmp_path / "first")
     trainer = Trainer(replace(CONFIG, seed=2), "cpu")
-    trainer.begin_with(first)
+    trainer.begin_with(tmp_path / "first" / "checkpoint.pt", [])
     assert trainer.step == 0
     torch.testing.assert_close(trainer.modules.state_dict(), first.modules)
     with pytest.raises(ValueError, match="do not fit"):
-        Trainer(replace(CONFIG, kind="paper"), "cpu").begin_with(first)
+        Trainer(replace(CONFIG, kind="paper"), "cpu").begin_with(tmp_path / "first" / "checkpoint.pt", [])
+
+
+def test_a_new_run_goes_on_from_a_model_folder() -> None:
+    batch = collate([draw_sample(seed, SCENES, []) for seed in range(2)], np.random.default_rng(0))
+    trainer = Trainer(CONFIG, "cpu")
+    trainer.begin_with(SHIPPED, [batch])
+    begun, shipped = folded(trainer.pair).modules(), folded(restored(SHIPPED)).modules()
+    torch.testing.assert_close(begun.state_dict(), shipped.state_dict(), rtol=1e-3, atol=1e-4)
 
 
 def test_a_stopped_run_goes_on_as_if_it_had_not_been_stopped(textures: Path, tmp_path: Path) -> None:
