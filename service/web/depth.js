@@ -432,7 +432,7 @@ function Progress({ phase, onCancel }) {
 function Warnings({ texts }) {
   if (texts.length === 0) return null;
   return html`<ul class="notice depth-warnings">
-    ${texts.map((text) => html`<li key=${text}>${text[0].toUpperCase() + text.slice(1)}</li>`)}
+    ${texts.map((text) => html`<li key=${text}>${text.replace(/^[a-z](?!\w*_)/, (one) => one.toUpperCase())}</li>`)}
   </ul>`;
 }
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from playwright.sync_api import Browser, Locator, Page, Position, expect
 
 from model_export.served import Server, serving
+from tests.inference import photographs
 from tests.web.chromium import PROGRAMS
 from tests.web.watched import watched
 
@@ -426,6 +427,15 @@ def test_a_full_service_says_when_and_a_cancelled_photograph_makes_room(
         second.get_by_role("button", name="Try again").click()
         stage(second)
         expect(second.get_by_role("alert")).to_have_count(0)
+
+
+def test_a_photograph_that_browsers_do_not_show_is_read_all_the_same(opened: Page) -> None:
+    choose(opened)
+    give(opened, photographs.tiff(cv2.imread(str(PHOTOGRAPH), cv2.IMREAD_COLOR_RGB)))
+    picture = stage(opened)
+    picture.hover()
+    expect(opened.get_by_role("region", name="Under the pointer")).to_contain_text("±")
+    expect(opened.locator("[data-picture=photograph]")).to_be_hidden()
 
 
 def test_a_service_that_ends_meanwhile_is_told_of(narrow: Server, browser: Browser, twelve_megapixels: bytes) -> None:
