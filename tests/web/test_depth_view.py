@@ -431,7 +431,8 @@ def test_a_full_service_says_when_and_a_cancelled_photograph_makes_room(
 
 def test_a_photograph_that_browsers_do_not_show_is_read_all_the_same(opened: Page) -> None:
     choose(opened)
-    give(opened, photographs.tiff(cv2.imread(str(PHOTOGRAPH), cv2.IMREAD_COLOR_RGB)))
+    pixels = np.asarray(cv2.imread(str(PHOTOGRAPH), cv2.IMREAD_COLOR_RGB), np.uint8)
+    give(opened, photographs.tiff(pixels))
     picture = stage(opened)
     picture.hover()
     expect(opened.get_by_role("region", name="Under the pointer")).to_contain_text("±")
