@@ -22,6 +22,7 @@ from service.optics.light import decode_srgb, encode_srgb
 SIDES = ("near", "far", "both")
 SIDE_SHARES = (0.45, 0.2, 0.35)
 ROOM_SHARE = 0.5
+WALL_SHARE = 0.1  # nothing but a level wall: what people photograph first, and what rooms seldom hold
 LAYERED_SHARE = 0.7
 NEAREST_AT_MOST, FARTHEST_AT_LEAST = 0.5, 2.0
 CLOSE_SHARE = 0.5
@@ -174,7 +175,11 @@ def draw_layers(
     def draw(texture_size: int) -> Map:
         return draw_texture(rng, photographs, texture_size)
 
-    if rng.random() < ROOM_SHARE:
+    kind = rng.random()
+    if kind < WALL_SHARE:
+        alpha = np.ones((size, size), np.float32)
+        surfaces = [Surface(decode_srgb(draw(size)), alpha, alpha * np.float32(_draw_excess(rng, shot, config)))]
+    elif kind < WALL_SHARE + ROOM_SHARE:
         far, near = sorted(_draw_excess(rng, shot, config) for _ in range(2))
         surfaces = draw_room(
             rng,

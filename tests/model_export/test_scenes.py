@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from model_export import scenes
 from model_export.config import SceneConfig
 from model_export.scenes import draw_sample, true_blur_px
 
@@ -39,3 +40,10 @@ def test_all_sides_and_lens_shapes_turn_up() -> None:
     shots = [draw_sample(seed, SceneConfig(size_px=32, margin_px=8), []).shot for seed in range(60)]
     assert {shot.side for shot in shots} == {-1, 0, 1}
     assert {0.0, 1.0} < {shot.spread.disc_share for shot in shots}
+
+
+def test_some_scenes_are_nothing_but_a_level_wall(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scenes, "WALL_SHARE", 1.0)
+    monkeypatch.setattr(scenes, "RESCALED_SHARE", 0.0)
+    for seed in range(4):
+        assert np.ptp(draw_sample(seed, CONFIG, []).excess) == 0
