@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 PIXEL_BUDGET = 2_300_000
-OVERLAP_PX = 128
+OVERLAP_PX = 224
 
 Maps = dict[str, NDArray[np.float32]]
 

@@ -48,8 +48,8 @@ def test_a_reader_that_disagrees_with_itself_leaves_no_seam() -> None:
     def read(tile: NDArray[np.uint8]) -> dict[str, NDArray[np.float32]]:
         return {"level": np.full(tile.shape[:2], next(answers), np.float32)}
 
-    rgb = np.zeros((900, 1100, 3), np.uint8)
-    level = read_in_tiles(rgb, read, multiple=16, stride=1, pixel_budget=300_000)["level"]
+    rgb = np.zeros((1500, 1800, 3), np.uint8)
+    level = read_in_tiles(rgb, read, multiple=16, stride=1, pixel_budget=500_000)["level"]
     assert level.max() > 2
     steps = max(np.abs(np.diff(level, axis=0)).max(), np.abs(np.diff(level, axis=1)).max())
     assert steps < 0.06
