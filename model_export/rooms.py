@@ -132,7 +132,7 @@ def _meet_ellipsoid(origin: Map, along: Map, extent: Map) -> Meeting:
     z = _first_root((d * d).sum(2), d @ o, (o * o).sum() - 1)
     unit = o + np.where(np.isfinite(z), z, 0)[..., None] * d
     normals = unit / extent
-    normals /= np.linalg.norm(normals, axis=2, keepdims=True) + 1e-9
+    normals /= _length(normals)[..., None] + 1e-9
     size = extent.mean()
     places = np.stack([np.arctan2(unit[..., 1], unit[..., 0]), np.arcsin(np.clip(unit[..., 2], -1, 1))], 2) * size
     return z, normals, places
@@ -167,12 +167,13 @@ _MEET: dict[str, Callable[[Map, Map, Map], Meeting]] = {
 def _painted(texture: Map, places: Map, level: Map) -> Map:
     """The sRGB texture [n,n,3] at places [h,w,2] in its pixels, mirrored on and on, each ``level`` octaves reduced."""
     level = np.clip(level, 0, MOST_LEVELS - 1)
+    places = places.astype(np.float32)
     out = np.zeros((*level.shape, 3), np.float32)
     for octave in range(int(level.min()), int(np.ceil(level.max())) + 1):
         size = texture.shape[0] >> octave
         reduced = cv2.resize(texture, (size, size), interpolation=cv2.INTER_AREA) if octave else texture
-        within = np.abs(np.mod(places / 2**octave, 2 * size) - size)
-        within = np.clip(within, 0, size - 1).astype(np.float32)
+        within = np.abs(np.mod(places / np.float32(2**octave), np.float32(2 * size)) - np.float32(size))
+        within = np.clip(within, 0, size - 1)
         seen = cv2.remap(reduced, within[..., 0], within[..., 1], cv2.INTER_LINEAR)
         out += np.clip(1 - np.abs(level - octave), 0, 1)[..., None] * np.asarray(seen, np.float32)
     return out
@@ -182,7 +183,7 @@ def _paint(texture: Map, hits: Hits, rays: Map, view: View, nearest_z: float) ->
     """Linear colour [h,w,3] of the points hit: the texture, as sharp as pixels allow where it is nearest."""
     z = np.where(np.isfinite(hits.z), hits.z, nearest_z)
     texel = nearest_z / (view.focal_px * OVERSAMPLE)
-    slant = np.abs((hits.normals * rays).sum(2)) / np.linalg.norm(rays, axis=2)
+    slant = np.abs(np.einsum("hwc,hwc->hw", hits.normals, rays)) / _length(rays)
     level = np.log2(z / nearest_z / np.sqrt(np.clip(slant, 0.05, 1)))
     return decode_srgb(_painted(texture, hits.places / texel, level))
 
@@ -201,6 +202,10 @@ def _reduced(samples: NDArray[np.floating], size: tuple[int, int]) -> Map:
 def _unit(vector: Vector) -> Vector:
     out: Vector = vector / np.linalg.norm(vector)
     return out
+
+
+def _length(vectors: Map) -> Map:
+    return np.asarray(np.sqrt(np.einsum("hwc,hwc->hw", vectors, vectors)), np.float32)
 
 
 def _across(up: Vector) -> tuple[Vector, Vector]:
@@ -304,7 +309,7 @@ def _shadow(rng: np.random.Generator, points: Map, solids: list[Solid], up: Vect
         way = (away * reach).astype(np.float32)
         beside = points - foot.astype(np.float32)
         share = np.clip((beside @ way) / max(float(way @ way), 1e-9), 0, 1)
-        distance = np.linalg.norm(beside - share[..., None] * way, axis=2)
+        distance = _length(beside - share[..., None] * way)
         soft = width * softness * (0.3 + share)
         out *= 1 - np.float32(strength) / (1 + np.exp(np.clip((distance - width) / soft * 4, -30, 30)))
     return out

@@ -22,7 +22,8 @@ from service.optics.light import decode_srgb, encode_srgb
 SIDES = ("near", "far", "both")
 SIDE_SHARES = (0.45, 0.2, 0.35)
 ROOM_SHARE = 0.5
-WALL_SHARE = 0.1  # nothing but a level wall: what people photograph first, and what rooms seldom hold
+WALL_SHARE = 0.25  # nothing but a wall: what people photograph first, and what rooms seldom hold
+LEVEL_SHARE = 0.5
 LAYERED_SHARE = 0.7
 NEAREST_AT_MOST, FARTHEST_AT_LEAST = 0.5, 2.0
 CLOSE_SHARE = 0.5
@@ -178,7 +179,10 @@ def draw_layers(
     kind = rng.random()
     if kind < WALL_SHARE:
         alpha = np.ones((size, size), np.float32)
-        surfaces = [Surface(decode_srgb(draw(size)), alpha, alpha * np.float32(_draw_excess(rng, shot, config)))]
+        middle = _draw_excess(rng, shot, config)
+        level = rng.random() < LEVEL_SHARE
+        excess = alpha * np.float32(middle) if level else _surface(rng, middle, _excess_bounds(shot, config), size)
+        surfaces = [Surface(decode_srgb(draw(size)), alpha, excess)]
     elif kind < WALL_SHARE + ROOM_SHARE:
         far, near = sorted(_draw_excess(rng, shot, config) for _ in range(2))
         surfaces = draw_room(

@@ -15,6 +15,7 @@ KINDS = ("photo", "leaves", "objects", "noise", "drawing")
 KIND_SHARES = (0.42, 0.18, 0.23, 0.05, 0.12)
 FADED_SHARE = 0.45
 SHADED_SHARE = 0.5
+SOFT_SIGMA_PX = 4.0
 LETTERS = "ABCDEFGHJKLMNPRSTUVXYZabcdefghkmnoprstuvxyz0123456789&%#?"
 
 Image = NDArray[np.float32]
@@ -208,9 +209,18 @@ def _shaded(rng: np.random.Generator, texture: Image) -> Image:
         mask = np.zeros((size, size), np.uint8)
         cv2.fillConvexPoly(mask, cv2.convexHull(corners.astype(np.int32)), 255)
         softness = float(np.exp(rng.uniform(np.log(3), np.log(40))))
-        soft = np.asarray(cv2.GaussianBlur(mask, (0, 0), softness), np.float32) / np.float32(255)
+        soft = _softened(mask, softness)
         light *= 1 - np.float32(rng.uniform(-0.4, 0.6)) * soft
     return np.asarray(np.clip(texture * light[..., None], 0, 1), np.float32)
+
+
+def _softened(mask: NDArray[np.uint8], sigma: float) -> Image:
+    """The mask [n, n] as 0..1 with edges of this softness, which is worked out on a copy as small as it allows."""
+    size = mask.shape[0]
+    small = max(8, min(size, round(size * SOFT_SIGMA_PX / sigma)))
+    reduced = cv2.resize(mask, (small, small), interpolation=cv2.INTER_AREA)
+    soft = cv2.GaussianBlur(np.asarray(reduced, np.float32), (0, 0), sigma * small / size)
+    return np.asarray(cv2.resize(soft, (size, size), interpolation=cv2.INTER_CUBIC), np.float32) / np.float32(255)
 
 
 def _recolor(rng: np.random.Generator, texture: Image) -> Image:

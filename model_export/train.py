@@ -86,8 +86,8 @@ class Pool:
         self.missing = self._drawn(step) - first
 
     def _drawn(self, step: int) -> int:
-        """How many scenes have come in before ``step``: a few batches first, then the steady flow."""
-        return 4 * self.config.batch + step * self.config.fresh_per_step
+        """How many scenes have come in before ``step``: a full pool first, then the steady flow."""
+        return self.config.pool + step * self.config.fresh_per_step
 
     def fill(self) -> Iterator[int]:
         """Bring the pool to its state at the first step, one scene at a time."""
