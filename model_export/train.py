@@ -26,6 +26,7 @@ from torch.utils.data import DataLoader, Dataset
 from model_export.config import SceneConfig, TrainConfig
 from model_export.losses import Batch, run_pair, total_loss
 from model_export.networks import Pair, make_pair
+from model_export.optimizers import Optimizers
 from model_export.progress import progress_bar
 from model_export.restored import restored, spread_norms
 from model_export.scenes import Sample, draw_sample
@@ -138,7 +139,7 @@ class Checkpoint:
     config: TrainConfig
     step: int
     modules: dict[str, Any]
-    optimizer: dict[str, Any]
+    optimizers: list[dict[str, Any]]
 
     def save(self, path: Path) -> None:
         """Write whole or not at all."""
@@ -146,7 +147,7 @@ class Checkpoint:
             "config": self.config.as_dict(),
             "step": self.step,
             "modules": self.modules,
-            "optimizer": self.optimizer,
+            "optimizers": self.optimizers,
         }
         scratch = path.with_suffix(".part")
         torch.save(content, scratch)
@@ -156,7 +157,7 @@ class Checkpoint:
     def load(cls, path: Path) -> "Checkpoint":
         content = torch.load(path, map_location="cpu", weights_only=True)
         config = TrainConfig.from_dict(content["config"])
-        return cls(config, content["step"], content["modules"], content["optimizer"])
+        return cls(config, content["step"], content["modules"], content.get("optimizers", []))
 
     def averaged(self, other: "Checkpoint", share: float = 0.5) -> "Checkpoint":
         """This one with its weights moved by ``share`` towards those of a run that was trained on from it.
@@ -205,13 +206,11 @@ class Trainer:
         self.pair = make_pair(config.kind)
         self.modules = self.pair.modules().to(self.device)
         convert_conv2d_weight_memory_format(self.modules, torch.channels_last)
-        self.optimizer = torch.optim.AdamW(
-            self.modules.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
-        )
+        self.optimizers = Optimizers(self.modules, config.weight_decay)
         self.step = 0
         if resume is not None:
             self.modules.load_state_dict(resume.modules)
-            self.optimizer.load_state_dict(resume.optimizer)
+            self.optimizers.load_state_dict(resume.optimizers)
             self.step = resume.step
 
     def begin_with(self, weights: Path, batches: Iterable[Batch]) -> None:
@@ -234,18 +233,16 @@ class Trainer:
 
     def advance(self, batch: Batch) -> dict[str, float]:
         """One optimiser step on a batch; the loss's parts."""
-        for group in self.optimizer.param_groups:
-            group["lr"] = learning_rate(self.config, self.step)
         self.modules.train()
         if self.step >= settling_step(self.config):
             for norm in self._norms():
                 norm.eval()
         with self.autocast():
             loss, parts = total_loss(self.pair, batch, self.config)
-        self.optimizer.zero_grad(set_to_none=True)
+        self.optimizers.zero_grad()
         torch.autograd.backward(loss)
         torch.nn.utils.clip_grad_norm_(self.modules.parameters(), self.config.clip_norm)
-        self.optimizer.step()
+        self.optimizers.step(learning_rate(self.config, self.step))
         self.step += 1
         return {name: float(part) for name, part in parts.items()}
 
@@ -277,7 +274,7 @@ class Trainer:
         return {name: float(part) for name, part in parts.items()}
 
     def checkpoint(self) -> Checkpoint:
-        return Checkpoint(self.config, self.step, self.modules.state_dict(), self.optimizer.state_dict())
+        return Checkpoint(self.config, self.step, self.modules.state_dict(), self.optimizers.state_dict())
 
 
 class Pace:
