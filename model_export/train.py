@@ -239,7 +239,7 @@ class Trainer:
                 norm.eval()
         with self.autocast():
             loss, parts = total_loss(self.pair, batch, self.config)
-        self.optimizers.zero_grad()
+        self.modules.zero_grad(set_to_none=True)
         torch.autograd.backward(loss)
         torch.nn.utils.clip_grad_norm_(self.modules.parameters(), self.config.clip_norm)
         self.optimizers.step(learning_rate(self.config, self.step))

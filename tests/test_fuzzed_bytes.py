@@ -54,6 +54,6 @@ def test_no_bytes_break_the_service(tmp_path: Path, tiny_model_dir: Path, is_soa
         events: list[dict[str, Any]] = [json.loads(line) for line in server.log.splitlines() if line.startswith("{")]
         faults = [event for event in events if event["level"] in ("error", "critical")]
         assert not faults, faults[:3]
-        print(f"\n{statuses}, peak {server.peak_memory_bytes / 1e6:.0f} MB")  # noqa: T201
+        print(f"\n{statuses}, peak {server.peak_memory_bytes / 1e6:.0f} MB")
     # enough of them got far: a fuzzer that is refused at the door finds nothing
     assert statuses[200] > sum(statuses.values()) * 0.1

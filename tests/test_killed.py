@@ -159,7 +159,7 @@ def test_what_was_acknowledged_survives_kills(tmp_path: Path, tiny_model_dir: Pa
                 for path in calibrations:
                     assert server.ask("GET", path).json()["state"] == "succeeded"
                 assert server.stop(signal.SIGTERM) == 0
-    print(f"{dict(counts)}")  # noqa: T201  (figures, for who asks with -s)
+    print(f"{dict(counts)}")
     assert counts["acknowledged writes to cameras"] > 0
     assert counts["acknowledged calibrations"] > 0
 

@@ -152,7 +152,7 @@ def test_a_killed_migration_leaves_the_old_schema_or_the_new(tmp_path: Path, beg
     assert found.total() == rounds + 1
     assert set(found) <= {begin, schema.head_revision()}
     assert found[begin] > 0 or not is_soak
-    print(f"killed migrations from {begin}: {dict(found)}")  # noqa: T201  (figures, for who asks with -s)
+    print(f"killed migrations from {begin}: {dict(found)}")
     for folder in tmp_path.glob("killed-*"):
         engine = open_engine(f"sqlite:///{folder / 'camind.sqlite3'}")
         schema.upgrade(engine)

@@ -126,7 +126,7 @@ def test_nothing_grows(tmp_path: Path, tiny_model_dir: Path, is_soak: bool) -> N
         send(requests)
         after = held(server)
         statuses = sum((client.statuses for client in clients), Counter[str]())
-        print(f"{before} became {after} after {requests} requests: {dict(statuses)}")  # noqa: T201  (figures, with -s)
+        print(f"{before} became {after} after {requests} requests: {dict(statuses)}")
         assert "Traceback" not in server.log
         server.poll(lambda: not [path for path in (data_dir / "calibrations").iterdir() if path.is_dir()])
     assert not [key for key in statuses if key.endswith(" 500")]

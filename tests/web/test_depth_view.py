@@ -473,7 +473,7 @@ def test_the_page_stays_fluid(
     frame_ms = opened.evaluate(FIRST_FRAME)
     tasks = tasks_ms(browser.stop_tracing())
     blocking_ms = np.maximum(tasks - 50, 0).sum()
-    print(f"main thread blocked {blocking_ms:.0f} ms, longest task {tasks.max():.0f} ms; 3D after {frame_ms:.0f} ms")  # noqa: T201
+    print(f"main thread blocked {blocking_ms:.0f} ms, longest task {tasks.max():.0f} ms; 3D after {frame_ms:.0f} ms")
     assert blocking_ms < 300
     # 0.5 s where nothing else runs
     assert frame_ms < 15_000
