@@ -162,6 +162,7 @@ def trained_ranges(scenes: SceneConfig) -> Ranges:
         focus_distance_m=Interval(*scenes.focus_distance_m),
         focal_length_px=Interval(*scenes.focal_length_px),
         gamma_px=Interval(*scenes.gamma_px),
+        depth_ratio=Interval(*scenes.depth_ratio),
     )
 
 

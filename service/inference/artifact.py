@@ -120,13 +120,17 @@ Range = Annotated[Interval, AfterValidator(_require_ordered)]
 
 
 class Ranges(_Part):
-    """What the pair was trained on, in pixels of the image it is given; beyond it answers are a guess."""
+    """What the pair was trained on, in pixels of the image it is given; beyond it answers are a guess.
+
+    ``depth_ratio`` is that of depth to the focus distance; beyond it, or beyond ``blur_px``, there is no answer.
+    """
 
     blur_px: Range
     k_cam_px: Range
     focus_distance_m: Range
     focal_length_px: Range
     gamma_px: Range
+    depth_ratio: Range = Interval(0.15, 8.0)
 
 
 class Training(_Part):

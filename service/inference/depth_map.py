@@ -15,6 +15,7 @@ from service.optics import thin_lens
 from service.optics.camera import Camera
 
 MAX_RELATIVE_ERROR = 1.0
+NO_ANSWER = np.float32(1e3)  # a relative error that no reading states
 LEAST_BLUR_ERROR_PX = 0.05  # nobody reads blur better: no stated error is below what it does to depth
 SIGMA_OF_LAPLACE = np.float32(2**0.5)
 
@@ -64,7 +65,8 @@ class Reading:
     """Raw maps of one copy of the photograph, with the camera at that copy's size, and what they say at their cells.
 
     ``near_m`` and ``far_m`` are both hypotheses, the far one NaN where there is none, and ``error`` that of depth,
-    relative.
+    relative: ``NO_ANSWER`` where the copy shows more blur than the model was trained on. ``trained_m`` are the nearest
+    and the farthest depth that it knows.
     """
 
     maps: RawMaps
@@ -73,6 +75,7 @@ class Reading:
     near_m: Array
     far_m: Array
     error: Array
+    trained_m: tuple[float, float]
     ratio: Ratio
 
     @classmethod
@@ -80,13 +83,17 @@ class Reading:
         """``photograph_size`` is (height, width)."""
         x = thin_lens.relative_defocus_from_blur(maps["blur_px"], camera.gamma_px, camera.k_cam_px)
         focus_m = np.float32(camera.focus_distance_m)
+        error = np.exp(maps["log_scale"]) * (SIGMA_OF_LAPLACE * np.float32(manifest.temperature))
+        error[maps["blur_px"] > manifest.ranges.blur_px.high] = NO_ANSWER
+        nearest, farthest = manifest.ranges.depth_ratio
         return cls(
             maps,
             camera,
             camera.image_width_px / photograph_size[1],
             np.exp(maps["log_ratio_near"]) * focus_m,
             np.where(x < 1, np.exp(maps["log_ratio_far"]) * focus_m, np.float32(np.nan)),
-            np.exp(maps["log_scale"]) * (SIGMA_OF_LAPLACE * np.float32(manifest.temperature)),
+            error,
+            (nearest * camera.focus_distance_m, farthest * camera.focus_distance_m),
             Ratio.between(photograph_size, (camera.image_height_px, camera.image_width_px), manifest.stride),
         )
 
@@ -145,5 +152,7 @@ def _told(reading: Reading, size: tuple[int, int], side: Side) -> Layers:
     camera = reading.camera
     floor = thin_lens.depth_error(1.0, camera.focus_distance_m, camera.k_cam_px, LEAST_BLUR_ERROR_PX)
     np.fmax(error, np.float32(floor) * depth_m, out=error)
+    nearest_m, farthest_m = reading.trained_m
+    error[(depth_m < nearest_m) | (depth_m > farthest_m)] = NO_ANSWER
     blur_px /= np.float32(reading.scale)
     return Layers(depth_m, other_m, p_near, error, blur_px)

@@ -12,12 +12,12 @@ from service.inference.artifact import Interval, load_model_folder
 from service.inference.cancellation import Cancellation, Cancelled
 from service.inference.depth_map import LEAST_BLUR_ERROR_PX
 from service.inference.estimator import Estimator
-from service.inference.pair import GraphPair, RawMaps
+from service.inference.pair import GraphPair, RawMaps, Side
 from service.inference.part import Part
 from service.inference.tiles import OVERLAP_PX
 from service.optics import thin_lens
 from service.optics.camera import Camera, Intrinsics
-from tests.inference.oracle_pair import LOG_DEPTH_SCALE, blur_of, build_oracle_pair
+from tests.inference.oracle_pair import LOG_DEPTH_SCALE, blur_of, brightness_for, build_oracle_pair
 
 CAMERA = Camera(96, 64, 2.0, 6.0, 0.5)
 
@@ -40,7 +40,7 @@ def expected_x(level: int, camera: Camera = CAMERA) -> float:
     return thin_lens.relative_defocus_from_blur(blur_of(level), camera.gamma_px, camera.k_cam_px)
 
 
-@pytest.mark.parametrize("level", [0, 20, 60, 100, 140])
+@pytest.mark.parametrize("level", [0, 20, 60, 100, 130])
 def test_a_level_of_blur_becomes_the_thin_lens_depth_on_either_side(estimator: Estimator, level: int) -> None:
     x = expected_x(level)
     near = estimator.estimate(grey(level), CAMERA, "near")
@@ -151,6 +151,24 @@ def test_an_answer_that_is_too_unsure_is_none(tmp_path: Path) -> None:
     for hidden in (answer.depth_m, answer.depth_alt_m, answer.sigma_m):
         assert np.isnan(hidden).all()
     assert "only 0% of the pixels have an answer" in answer.warnings
+
+
+def test_more_blur_than_the_model_was_trained_on_has_no_answer(tmp_path: Path) -> None:
+    folder = build_oracle_pair(tmp_path / "model", blur_range=Interval(0.3, 5.0))
+    halves = np.hstack([grey(brightness_for(4.0), 64, 48), grey(brightness_for(6.0), 64, 48)])
+    valid = Estimator.from_folder(load_model_folder(folder)).estimate(halves, CAMERA, "near").valid
+    assert valid[:, :46].all()
+    assert not valid[:, 50:].any()
+
+
+@pytest.mark.parametrize(("blur_px", "k_cam_px", "side"), [(6.0, 1.0, "near"), (5.7, 6.0, "far")])
+def test_depths_beyond_the_models_range_have_no_answer(
+    estimator: Estimator, blur_px: float, k_cam_px: float, side: Side
+) -> None:
+    beyond = estimator.estimate(grey(brightness_for(blur_px)), replace(CAMERA, k_cam_px=k_cam_px), side)
+    within = estimator.estimate(grey(brightness_for(0.8 * blur_px)), replace(CAMERA, k_cam_px=k_cam_px), side)
+    assert not beyond.valid.any()
+    assert within.valid.all()
 
 
 def test_two_threads_get_the_answer_of_one(estimator: Estimator) -> None:
