@@ -33,6 +33,7 @@ ROUND_SHARE = 0.7
 CHROMATIC_SHARE = 0.4
 CHROMATIC_PX = 0.8
 CHROMATIC_PART = 0.15
+ACHROMAT_SHARE = 0.75
 MOSAIC_SHARE = 0.4
 MOSAIC_VARIANCE = 0.35  # what a bilinear demosaic adds to luminance, px^2
 PLAIN_SHARE = 0.35  # not compressed: the network must not need the noise of JPEG
@@ -91,12 +92,17 @@ def draw_shot(rng: np.random.Generator, config: SceneConfig) -> Shot:
 
 
 def _draw_spread(rng: np.random.Generator, k_cam_px: float) -> PointSpread:
-    """A Gaussian, a disc or between; sometimes squeezed; sometimes red and blue focused elsewhere than green."""
+    """A Gaussian, a disc or between; sometimes squeezed; sometimes red and blue focused elsewhere than green.
+
+    Most lenses are achromats, which focus green nearest to the lens: red and blue are blurrier than green before the
+    plane in focus, sharper beyond it.
+    """
     shape = rng.random()
     disc_share = 0.0 if shape < GAUSSIAN_SHARE else 1.0 if shape > 1 - DISC_SHARE else rng.uniform(0.3, 1.0)
     squeeze = 1.0 if rng.random() < ROUND_SHARE else rng.uniform(0.7, 1.0)
     shift = min(CHROMATIC_PX, CHROMATIC_PART * k_cam_px) if rng.random() < CHROMATIC_SHARE else 0.0
-    red, blue = rng.uniform(-shift, shift, 2).tolist()
+    most = 0.0 if rng.random() < ACHROMAT_SHARE else shift
+    red, blue = rng.uniform(-shift, most, 2).tolist()
     return PointSpread(float(disc_share), float(squeeze), float(rng.uniform(0, math.pi)), (red, blue))
 
 

@@ -35,7 +35,7 @@ from model_export.textures import load_photographs
 FOCAL_UNKNOWN_SHARE = 0.3
 SIDE_HINT_SHARE = 0.5
 TURNED_SHARE = 0.3  # most are left upright: below is nearer, as in most photographs
-GUESSED_GAMMA_SHARE, GUESSED_GAMMA_SPREAD = 0.3, 0.25  # a camera known by its specs has a guess for gamma
+GUESSED_GAMMA_SHARE, GUESSED_GAMMA_SPREAD = 0.5, 0.3  # a camera known by its specs has a guess for gamma
 HELD_OUT_SEED = 2**40
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from model_export import scenes
 from model_export.config import SceneConfig
-from model_export.scenes import draw_sample, true_blur_px
+from model_export.scenes import draw_sample, draw_shot, true_blur_px
 
 CONFIG = SceneConfig(size_px=64, margin_px=24)
 SEEDS = range(30)
@@ -47,3 +47,10 @@ def test_some_scenes_are_nothing_but_a_level_wall(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(scenes, "RESCALED_SHARE", 0.0)
     for seed in range(4):
         assert np.ptp(draw_sample(seed, CONFIG, []).excess) == 0
+
+
+def test_most_lenses_blur_red_and_blue_more_before_the_focus_than_beyond() -> None:
+    rng = np.random.default_rng(0)
+    shifts = [shift for _ in range(400) for shift in draw_shot(rng, CONFIG).spread.chromatic_px if shift]
+    nearer_blurrier = np.array(shifts) < 0  # moves signed defocus, which is negative before the focus
+    assert 0.75 < nearer_blurrier.mean() < 0.98
