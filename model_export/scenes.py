@@ -19,8 +19,9 @@ from model_export.textures import draw_texture
 from service.optics import thin_lens
 from service.optics.light import decode_srgb, encode_srgb
 
-SIDES = ("near", "far", "both")
-SIDE_SHARES = (0.45, 0.2, 0.35)
+# all nearer than focus, all beyond, both; between the nearest focus and the farthest as its logarithm goes: the
+# background of a close-up is beyond its focus, and what a distant focus shows is mostly nearer
+SIDE_SHARES_CLOSE, SIDE_SHARES_DISTANT = (0.15, 0.4, 0.45), (0.45, 0.1, 0.45)
 ROOM_SHARE = 0.5
 WALL_SHARE = 0.25  # nothing but a wall: what people photograph first, and what rooms seldom hold
 LEVEL_SHARE = 0.5
@@ -75,12 +76,15 @@ def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float], lean: fl
 
 def draw_shot(rng: np.random.Generator, config: SceneConfig) -> Shot:
     """A random camera, focus distance, lens and side of focus within the config's ranges."""
-    side = rng.choice(3, p=SIDE_SHARES)
+    focus_distance_m = _log_uniform(rng, config.focus_distance_m)
+    nearest, farthest = config.focus_distance_m
+    distant = math.log(focus_distance_m / nearest) / math.log(farthest / nearest)
+    side = rng.choice(3, p=(1 - distant) * np.array(SIDE_SHARES_CLOSE) + distant * np.array(SIDE_SHARES_DISTANT))
     k_cam_px = _log_uniform(rng, config.k_cam_px, K_CAM_LEAN)
     return Shot(
         k_cam_px=k_cam_px,
         gamma_px=rng.uniform(*config.gamma_px),
-        focus_distance_m=_log_uniform(rng, config.focus_distance_m),
+        focus_distance_m=focus_distance_m,
         focal_length_px=_log_uniform(rng, config.focal_length_px),
         spread=_draw_spread(rng, k_cam_px),
         side=(-1, 1, 0)[side],

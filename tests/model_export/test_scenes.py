@@ -44,6 +44,7 @@ def test_all_sides_and_lens_shapes_turn_up() -> None:
 
 def test_some_scenes_are_nothing_but_a_level_wall(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scenes, "WALL_SHARE", 1.0)
+    monkeypatch.setattr(scenes, "LEVEL_SHARE", 1.0)
     monkeypatch.setattr(scenes, "RESCALED_SHARE", 0.0)
     for seed in range(4):
         assert np.ptp(draw_sample(seed, CONFIG, []).excess) == 0
