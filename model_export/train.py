@@ -77,7 +77,7 @@ def scene_stream(
 
 
 class Pool:
-    """The last ``pool`` scenes of the stream; ``fresh_per_step`` new ones come in before every batch."""
+    """The last ``pool`` scenes of the stream; ``fresh_per_step`` new ones come in after every batch, on average."""
 
     def __init__(self, config: TrainConfig, photographs: list[NDArray[np.uint8]], step: int, workers: int) -> None:
         self.config = config
@@ -88,7 +88,7 @@ class Pool:
 
     def _drawn(self, step: int) -> int:
         """How many scenes have come in before ``step``: a full pool first, then the steady flow."""
-        return self.config.pool + step * self.config.fresh_per_step
+        return self.config.pool + int(step * self.config.fresh_per_step)
 
     def fill(self) -> Iterator[int]:
         """Bring the pool to its state at the first step, one scene at a time."""
@@ -101,9 +101,9 @@ class Pool:
         rng = np.random.default_rng((self.config.seed, step))
         return collate([self.samples[i] for i in rng.integers(0, len(self.samples), self.config.batch)], rng)
 
-    def refresh(self) -> None:
-        """Let in the new scenes of one step; as many old ones go."""
-        for _ in range(self.config.fresh_per_step):
+    def refresh(self, step: int) -> None:
+        """Let in the new scenes that come after this step; as many old ones go."""
+        for _ in range(self._drawn(step), self._drawn(step + 1)):
             self.samples.append(next(self.stream))
 
 
@@ -290,9 +290,9 @@ class Pace:
         yield
         self.waited_s += time.perf_counter() - began
 
-    def told(self, steps: int, scenes_per_step: int) -> str:
+    def told(self, steps: int, scenes_per_step: float) -> str:
         spent_s = time.perf_counter() - self.started
-        return f"{steps * scenes_per_step / spent_s:.2f} scenes/s, waited {self.waited_s / spent_s:.0%}"
+        return f"{steps / spent_s:.2f} steps/s, {steps * scenes_per_step / spent_s:.2f} scenes/s, waited {self.waited_s / spent_s:.0%}"
 
 
 def train(
@@ -331,7 +331,7 @@ def train(
                 trainer.settle(pool.batch(config.steps + i) for i in range(config.settle_batches))
             recent.append(trainer.advance(pool.batch(trainer.step)))
             with pace.waiting():
-                pool.refresh()
+                pool.refresh(trainer.step - 1)
             progress.update(task, completed=trainer.step)
             if trainer.step % config.checkpoint_every == 0 or trainer.step == config.steps:
                 trainer.checkpoint().save(path)

@@ -21,7 +21,7 @@ from model_export.train import Checkpoint, Pool, Trainer, collate, learning_rate
 SHIPPED = Path(__file__).parents[2] / "service" / "models"
 SCENES = SceneConfig(size_px=32, margin_px=8)
 CONFIG = TrainConfig(
-    steps=6, batch=2, pool=8, fresh_per_step=1, checkpoint_every=3, settle_batches=3, warmup_steps=2, scenes=SCENES
+    steps=6, batch=2, pool=8, fresh_per_step=0.5, checkpoint_every=3, settle_batches=3, warmup_steps=2, scenes=SCENES
 )
 
 
@@ -95,7 +95,7 @@ def test_a_stopped_run_goes_on_as_if_it_had_not_been_stopped(textures: Path, tmp
     list(pool.fill())
     for step in range(3):
         halfway.advance(pool.batch(step))
-        pool.refresh()
+        pool.refresh(step)
     halfway.checkpoint().save(tmp_path / "stopped" / "checkpoint.pt")
     resumed, _ = run(CONFIG, textures, tmp_path / "stopped")
     for name, weight in whole.modules.items():
