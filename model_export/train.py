@@ -292,7 +292,8 @@ class Pace:
 
     def told(self, steps: int, scenes_per_step: float) -> str:
         spent_s = time.perf_counter() - self.started
-        return f"{steps / spent_s:.2f} steps/s, {steps * scenes_per_step / spent_s:.2f} scenes/s, waited {self.waited_s / spent_s:.0%}"
+        pace = steps / spent_s
+        return f"{pace:.2f} steps/s, {pace * scenes_per_step:.2f} scenes/s, waited {self.waited_s / spent_s:.0%}"
 
 
 def train(
