@@ -31,6 +31,7 @@ NEAR_LIMIT_M = 2.0
 LEAST_SCORED = 0.02
 D200 = Lens(35.0, 2.8, 6.05, 3872)
 D200_LIMIT_M = 5.0
+COUNTS = {True: (2, 2, 4, 8), False: (8, 20, 40, 60)}  # quick or not: few, several, many pictures, and scenes
 D200_STEP = 0.05
 D200_STEP_MARGIN_PX = 25
 CELL_PX = 32
@@ -44,11 +45,7 @@ PROCEDURAL_SIDES = {"near": -1, "far": 1, "mixed": 0}
 Map = NDArray[np.float32]
 
 
-def _centred(fx_px: float, width_px: int, height_px: int) -> Intrinsics:
-    return Intrinsics(fx_px, fx_px, (width_px - 1) / 2, (height_px - 1) / 2)
-
-
-REFERENCE = Camera(640, 480, 2.0, 3.81, 0.5, intrinsics=_centred(FRAME_FX_PX, 640, 480))
+REFERENCE = Camera(640, 480, 2.0, 3.81, 0.5, intrinsics=Intrinsics.centred(FRAME_FX_PX, 640, 480))
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +136,7 @@ def viewed_cases(folder: Path, count: int, view: float) -> Iterator[Case]:
         picture = cv2.resize(_encoded(photo)[cut], size, interpolation=how)
         depth = np.asarray(cv2.resize(photo.depth_m[cut], size, interpolation=cv2.INTER_NEAREST), np.float32)
         camera = replace(REFERENCE, image_width_px=size[0], image_height_px=size[1])
-        camera = replace(camera, intrinsics=_centred(FRAME_FX_PX / view, *size))
+        camera = replace(camera, intrinsics=Intrinsics.centred(FRAME_FX_PX / view, *size))
         blurred = refocus(np.clip(np.asarray(picture, np.float32), 0, 1), filled(depth), camera)
         yield Case(photo.name, to_pixels(blurred), _to_limit(depth), camera, "near")
 
@@ -169,7 +166,7 @@ def procedural_cases(count: int, side: int, first: int = 0) -> Iterator[Case]:
     for sample in itertools.islice((s for s in drawn if s.shot.side == side), count):
         shot = sample.shot
         height, width = sample.excess.shape
-        inner = _centred(shot.focal_length_px, width, height)
+        inner = Intrinsics.centred(shot.focal_length_px, width, height)
         camera = Camera(width, height, shot.focus_distance_m, shot.k_cam_px, shot.gamma_px, intrinsics=inner)
         truth = np.float32(shot.focus_distance_m) / (1 + sample.excess.astype(np.float32))
         image = np.ascontiguousarray(sample.image.transpose(1, 2, 0))
@@ -188,7 +185,7 @@ def blender_cases(folder: Path, count: int) -> Iterator[Case]:
     for photo in _spread(folder, count):
         height, width = photo.image.shape[:2]
         told = cameras[photo.name]
-        inner = _centred(told["fx_px"], width, height)
+        inner = Intrinsics.centred(told["fx_px"], width, height)
         camera = Camera(width, height, told["focus_distance_m"], told["k_cam_px"], told["gamma_px"], intrinsics=inner)
         blur_px = thin_lens.blur_at_depth(photo.depth_m, camera.focus_distance_m, camera.k_cam_px, camera.gamma_px)
         yield Case(photo.name, photo.image, photo.depth_m, camera, "auto", blur_px)
@@ -216,7 +213,7 @@ def _enough(source: CaseSource) -> Iterator[Case]:
 
 def trials(data: Path, quick: bool) -> list[Trial]:
     """The sets that the data folder can serve; a missing folder is a missing set."""
-    few, many, scenes = (2, 4, 8) if quick else (8, 40, 60)
+    few, _, many, scenes = COUNTS[quick]
     found = [_trial(FIXED, fixed_cases)]
     found += [
         _trial(f"procedural {n}", partial(procedural_cases, scenes, side)) for n, side in PROCEDURAL_SIDES.items()
@@ -239,7 +236,7 @@ def _trial(name: str, source: CaseSource, *further_modes: str) -> Trial:
 
 def _indoor_trials(folder: Path, quick: bool) -> list[Trial]:
     """Sharp frames refocused by several cameras, at other distances of focus and in other fields of view."""
-    few, several, many = (2, 2, 4) if quick else (8, 20, 40)
+    few, several, many, _ = COUNTS[quick]
 
     def by(camera: Camera, count: int, side: Side = "near") -> CaseSource:
         return partial(refocused_cases, folder, count, camera, side)

@@ -68,9 +68,22 @@ class Pixels:
         error, least_certain = np.abs(self.error), ~self.certain(0.5)
         return float(error[self.certain(0.1)].mean() / error[least_certain].mean()) if least_certain.any() else 1.0
 
+    @property
+    def answered(self) -> "Pixels":
+        """Those with an answer: the others are filled in and state no error."""
+        told = np.isfinite(self.stated)
+        return Pixels(self.truth[told], self.answer[told], self.stated[told])
+
+    @property
+    def deviations(self) -> Map:
+        """How many stated deviations the truth is off, of the pixels with an answer."""
+        told = self.answered
+        return np.asarray(np.abs(told.truth / told.answer - 1) / told.stated)
+
     def within(self, deviations: float) -> float:
-        """The share of pixels whose truth lies within so many stated deviations of the answer."""
-        return float((np.abs(self.truth / self.answer - 1) <= deviations * self.stated).mean())
+        """The share of answered pixels whose truth lies within so many stated deviations; NaN for none."""
+        off = self.deviations
+        return float((off <= deviations).mean()) if off.size else math.nan
 
     def kept_error(self, share: float) -> float:
         """The mean error of the share of the pixels that is most certain."""
@@ -134,12 +147,15 @@ class Summary:
     constant_pooled: Scores
     constant_mean: Scores
     median_error: float
-    certain_abs_rel: float
     order: float
     kept_abs_rel: tuple[float, ...]
     within: tuple[float, float]
     sides: Sides | None
     depth: Pixels
+
+    @property
+    def certain_abs_rel(self) -> float:
+        return self.kept_abs_rel[KEPT_SHARES.index(0.5)]
 
     def as_dict(self) -> dict[str, object]:
         plain = ("name", "mode", "pictures", "answered", "median_error", "certain_abs_rel", "order")
@@ -295,7 +311,6 @@ def summarise(name: str, mode: str, outcomes: Sequence[Outcome]) -> Summary:
         constant_pooled=pooled_scores([o.constant for o in outcomes], weights),
         constant_mean=mean_scores([o.constant for o in outcomes]),
         median_error=float(np.median([o.median_error for o in outcomes])),
-        certain_abs_rel=depth.kept_error(0.5),
         order=depth.order,
         kept_abs_rel=tuple(depth.kept_error(share) for share in KEPT_SHARES),
         within=(depth.within(1), depth.within(2)),

@@ -191,8 +191,9 @@ def _against_k_cam(axes: Axes, report: Report) -> None:
 def _calibration(axes: Axes, report: Report) -> None:
     """How many errors lie within the interval that should hold a given share of them (Laplace)."""
     for s in _of_depth(report):
-        scale = np.maximum(s.depth.stated, 1e-6) / math.sqrt(2)
-        error = np.abs(np.log(s.depth.answer / s.depth.truth))
+        told = s.depth.answered
+        scale = np.maximum(told.stated, 1e-6) / math.sqrt(2)
+        error = np.abs(np.log(told.answer / told.truth))
         axes.plot(NOMINAL, [(error <= -scale * math.log(1 - p)).mean() for p in NOMINAL], label=s.name)
     if report.sets:
         axes.plot([0, 1], [0, 1], color="black", linewidth=0.8)

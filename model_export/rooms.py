@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from model_export.datasets.photos import filled
 from service.optics.light import decode_srgb
 
 OVERSAMPLE = 2
@@ -21,6 +22,7 @@ PLAIN_SHARE, PLAIN_GROUND_SHARE = 0.25, 0.1
 LEANING_SHARE = 0.15
 LEAST_WALL_VIEW = 0.3
 LEAST_Q = 0.02
+LEAST_COVER, LEAST_SEEN = 0.2, 4  # of a pixel, and how many such pixels
 MOST_LEVELS = 4
 APPARENT = (0.06, 0.55)
 POLE_SHARE, POLE_PX = 0.15, (2.0, 10.0)
@@ -258,17 +260,6 @@ def _window(solid: Solid, view: View) -> tuple[slice, slice] | None:
     return slice(int(low[0]), int(high[0])), slice(int(low[1]), int(high[1]))
 
 
-def _continued(values: Map, known: NDArray[np.bool_]) -> Map:
-    """The map with every unknown pixel given the value of the nearest known one."""
-    labels = cv2.distanceTransformWithLabels((~known).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)[
-        1
-    ]
-    table = np.zeros(int(labels.max()) + 1, np.float32)
-    table[labels[known]] = values[known]
-    out: Map = table[labels]
-    return out
-
-
 def _solid_surface(
     rng: np.random.Generator, draw: DrawTexture, solid: Solid, view: View, light: Light
 ) -> Surface | None:
@@ -280,21 +271,22 @@ def _solid_surface(
     rays = view.rays(columns, rows)
     hits = solid.meet(rays)
     hit = np.isfinite(hits.z)
-    if hit.sum() < (2 * OVERSAMPLE) ** 2:
-        return None
     size = (columns.stop - columns.start, rows.stop - rows.start)
+    cover = _reduced(hit.astype(np.float32), size)
+    if (cover > LEAST_COVER).sum() < LEAST_SEEN:
+        return None
     paint = (
         _paint(_plain_or(rng, PLAIN_SHARE, draw(view.size)), hits, rays, view, float(hits.z[hit].min()))
         * light.on(hits.normals)[..., None]
     )
-    cover = _reduced(hit.astype(np.float32), size)
     color = _reduced(paint * hit[..., None], size)
     q = _reduced(np.where(hit, 1 / hits.z, 0).astype(np.float32), size) / np.maximum(cover, 1e-3)
     canvas = (view.size, view.size)
-    alpha, excess = np.zeros(canvas, np.float32), np.zeros(canvas, np.float32)
+    alpha, excess = np.zeros(canvas, np.float32), np.full(canvas, np.nan, np.float32)
     premultiplied = np.zeros((*canvas, 3), np.float32)
-    alpha[rows, columns], excess[rows, columns], premultiplied[rows, columns] = cover, q - 1, color
-    return Surface(premultiplied, alpha, _continued(excess, alpha > 0.2) if (alpha > 0.2).any() else excess)
+    alpha[rows, columns], premultiplied[rows, columns] = cover, color
+    excess[rows, columns] = np.where(cover > LEAST_COVER, q - 1, np.nan)
+    return Surface(premultiplied, alpha, filled(excess))
 
 
 def _shadow(rng: np.random.Generator, points: Map, solids: list[Solid], up: Vector, light: Light) -> Map:

@@ -78,7 +78,7 @@ def draw_shot(rng: np.random.Generator, config: SceneConfig) -> Shot:
     """A random camera, focus distance, lens and side of focus within the config's ranges."""
     focus_distance_m = _log_uniform(rng, config.focus_distance_m)
     nearest, farthest = config.focus_distance_m
-    distant = math.log(focus_distance_m / nearest) / math.log(farthest / nearest)
+    distant = math.log(focus_distance_m / nearest) / math.log(farthest / nearest) if farthest > nearest else 0.5
     side = rng.choice(3, p=(1 - distant) * np.array(SIDE_SHARES_CLOSE) + distant * np.array(SIDE_SHARES_DISTANT))
     k_cam_px = _log_uniform(rng, config.k_cam_px, K_CAM_LEAN)
     return Shot(
@@ -273,7 +273,12 @@ def draw_sample(seed: int, config: SceneConfig, photographs: list[NDArray[np.uin
     )
     # a pixel of the small picture averages those of the large one: its box is there before it is made small
     rest = max(shot.gamma_px**2 - PIXEL_BOX_VARIANCE, 0.0)
-    taken = replace(shot, k_cam_px=shot.k_cam_px * ratio, gamma_px=math.sqrt(rest * ratio**2 + PIXEL_BOX_VARIANCE))
+    taken = replace(
+        shot,
+        k_cam_px=shot.k_cam_px * ratio,
+        gamma_px=math.sqrt(rest * ratio**2 + PIXEL_BOX_VARIANCE),
+        focal_length_px=shot.focal_length_px * ratio,
+    )
     image, excess = _photograph(rng, taken, larger, photographs)
     small = cv2.resize(image.transpose(1, 2, 0), (size, size), interpolation=cv2.INTER_AREA)
     told = cv2.resize(excess.astype(np.float32), (size, size), interpolation=cv2.INTER_NEAREST)

@@ -1,4 +1,4 @@
-"""Stated errors made honest: one factor for all, found on scenes by cameras that were not trained on."""
+"""Stated errors made honest: one factor for all, found on scenes that were not trained on."""
 
 import math
 from pathlib import Path
@@ -17,20 +17,21 @@ DECIMALS = 3
 
 def temperature(pixels: Pixels) -> float:
     """What stated errors must be multiplied with to hold 68 and 95 %: the geometric mean where these differ."""
-    deviations = np.abs(pixels.truth / pixels.answer - 1) / pixels.stated
-    needed = [np.quantile(deviations, share) / reach for reach, share in HELD]
+    needed = [np.quantile(pixels.deviations, share) / reach for reach, share in HELD]
     return float(math.prod(needed) ** (1 / len(needed)))
 
 
 def calibrate(model: Path) -> Manifest:
     """Find the factor of a model folder and write it into its manifest, which is returned.
 
-    The side is told: being on the wrong side of focus is what the other hypothesis is for.
+    The side is told: being on the wrong side of focus is what the other hypothesis is for. Raises ``ValueError`` for a
+    model whose stated errors no factor in bounds makes honest.
     """
     examiner = Examiner(model)
     cases = [case for side in (-1, 1) for case in procedural_cases(SCENES, side, FIRST)]
     found = temperature(Pixels.joined([examiner.answer(case)[0].depth for case in cases]))
     before = load_model_folder(model).manifest
-    calibrated = before.model_copy(update={"temperature": round(before.temperature * found, DECIMALS)})
+    factor = round(before.temperature * found, DECIMALS)
+    calibrated = Manifest.model_validate(before.model_dump() | {"temperature": factor})
     write_manifest(model, calibrated)
     return calibrated

@@ -23,7 +23,7 @@ from rich.console import Console
 from torch.nn.utils import convert_conv2d_weight_memory_format
 from torch.utils.data import DataLoader, Dataset
 
-from model_export.config import SceneConfig, TrainConfig
+from model_export.config import Kind, SceneConfig, TrainConfig
 from model_export.losses import Batch, run_pair, total_loss
 from model_export.networks import Pair, make_pair
 from model_export.optimizers import Optimizers
@@ -81,10 +81,9 @@ class Pool:
 
     def __init__(self, config: TrainConfig, photographs: list[NDArray[np.uint8]], step: int, workers: int) -> None:
         self.config = config
-        first = max(0, self._drawn(step) - config.pool)
+        first = self._drawn(step) - config.pool
         self.stream = scene_stream(config, photographs, first, self._drawn(config.steps) + 1, workers)
         self.samples: deque[Sample] = deque(maxlen=config.pool)
-        self.missing = self._drawn(step) - first
 
     def _drawn(self, step: int) -> int:
         """How many scenes have come in before ``step``: a full pool first, then the steady flow."""
@@ -92,7 +91,7 @@ class Pool:
 
     def fill(self) -> Iterator[int]:
         """Bring the pool to its state at the first step, one scene at a time."""
-        for number in range(self.missing):
+        for number in range(self.config.pool):
             self.samples.append(next(self.stream))
             yield number
 
@@ -181,6 +180,17 @@ class Checkpoint:
         return pair
 
 
+def starting_pair(weights: Path, kind: Kind) -> Pair:
+    """The networks of a checkpoint, or of a model folder, whose batch norms are folded away and wait for statistics.
+
+    Raises ``ValueError`` for networks of another kind.
+    """
+    pair = restored(weights) if weights.is_dir() else Checkpoint.load(weights).pair()
+    if pair.kind != kind:
+        raise ValueError(f"weights of a {pair.kind} pair do not fit a {kind} pair")
+    return pair
+
+
 def learning_rate(config: TrainConfig, step: int) -> float:
     """Warm-up, a level stretch, and a straight fall to nothing over the last ``decay_share`` of the steps."""
     left = (config.steps - step) / max(1.0, config.steps * config.decay_share)
@@ -209,22 +219,14 @@ class Trainer:
         self.optimizers = Optimizers(self.modules, config.weight_decay)
         self.step = 0
         if resume is not None:
+            if not resume.optimizers:
+                raise ValueError("this checkpoint has no state to go on from: begin a new run with its --weights")
             self.modules.load_state_dict(resume.modules)
             self.optimizers.load_state_dict(resume.optimizers)
             self.step = resume.step
 
-    def begin_with(self, weights: Path, batches: Iterable[Batch]) -> None:
-        """Take over another run's weights, and nothing else of it: a checkpoint's or a model folder's.
-
-        A folder's batch norms are folded away; they are set to what these batches show them.
-        """
-        if weights.is_dir():
-            pair = restored(weights)
-            spread_norms(pair, (partial(run_pair, pair, batch) for batch in batches))
-        else:
-            pair = Checkpoint.load(weights).pair()
-        if pair.kind != self.config.kind:
-            raise ValueError(f"weights of a {pair.kind} pair do not fit a {self.config.kind} pair")
+    def begin_with(self, pair: Pair) -> None:
+        """Take over other networks' weights."""
         self.modules.load_state_dict(pair.modules().state_dict())
 
     def autocast(self) -> torch.autocast:
@@ -317,13 +319,17 @@ def train(
     path = run / "checkpoint.pt"
     resume = Checkpoint.load(path) if path.exists() else None
     trainer = Trainer(config, device, resume)
+    start = starting_pair(weights, config.kind) if weights is not None and resume is None else None
     pool = Pool(config, photographs, trainer.step, workers)
     test = held_out(config.scenes, photographs, 2 * config.batch)
     with progress_bar(console) as progress:
-        for _ in progress.track(pool.fill(), total=pool.missing, description="scenes"):
+        for _ in progress.track(pool.fill(), total=config.pool, description="scenes"):
             pass
-        if resume is None and weights is not None:
-            trainer.begin_with(weights, (pool.batch(config.steps + i) for i in range(config.settle_batches)))
+        if start is not None and weights is not None:
+            if weights.is_dir():
+                batches = (pool.batch(config.steps + i) for i in range(config.settle_batches))
+                spread_norms(start, (partial(run_pair, start, batch) for batch in batches))
+            trainer.begin_with(start)
         task = progress.add_task("training", total=config.steps, completed=trainer.step)
         recent: deque[dict[str, float]] = deque(maxlen=config.checkpoint_every)
         pace = Pace()

@@ -7,6 +7,7 @@ from importlib.metadata import version
 
 from fastapi import FastAPI
 from fastapi_offline import FastAPIOffline
+from threadpoolctl import threadpool_limits
 
 from service.access import Authenticate
 from service.api import calibrations, cameras, depth, handlers, health, look, metrics, model, openapi, pages, target
@@ -109,6 +110,7 @@ def _start(app: FastAPI) -> None:
     folder = load_model_folder(settings.served_model_dir)
     estimator = Estimator.from_folder(folder, intra_op_threads=settings.threads_per_worker)
     estimator.warm_up()
+    threadpool_limits(1, "blas")  # the sums of a calibration are small: more threads would wait for each other
     app.state.engine = engine
     app.state.keys = Keys(engine)
     app.state.model = folder

@@ -46,7 +46,7 @@ def load_photos(folder: Path, every: int = 1) -> Iterator[Photo]:
 
 
 def filled(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Depth with every unknown pixel given the value of the nearest known one."""
+    """A map [h,w] with every NaN given the value of the nearest pixel that has one."""
     known = np.isfinite(depth_m)
     _, labels = cv2.distanceTransformWithLabels(
         (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL

@@ -6,6 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from service.api.cursors import NextCursor
 from service.api.problems import invalid_request
 from service.api.schemas import Given, Name, PinholeIntrinsics
 from service.calibration.edge import Shape
@@ -180,7 +181,7 @@ class LookRead(BaseModel):
     height_px: int
     orientation: Annotated[int, Field(ge=1, le=8, description="EXIF's: how a viewer turns the photograph")]
     circles: Annotated[list[CircleRead], Field(description="All of the grid, row by row")]
-    measured: Annotated[int, Field(description="How many of a dozen circles gave a blur")]
+    measured: Annotated[int, Field(description="How many gave a blur, of up to a dozen looked at")]
     blur_px: Annotated[float | None, Field(description="Median blur of its circles, a standard deviation")]
     distance_m: Annotated[float | None, Field(description="Depth of the grid's middle, along the optical axis")]
     tilt_deg: Annotated[float | None, Field(description="Between grid and sensor")]
@@ -221,7 +222,7 @@ class CalibrationPage(BaseModel):
     """Calibrations, the newest first."""
 
     items: list[CalibrationItem]
-    next_cursor: Annotated[str | None, Field(description="Pass it as `cursor` for the next page; null: the last")]
+    next_cursor: NextCursor
 
 
 class CalibrationRead(CalibrationItem):

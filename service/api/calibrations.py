@@ -21,7 +21,7 @@ from service.api.calibration_schemas import (
     CalibrationSettings,
 )
 from service.api.calibration_uploads import DEFOCUSED, FOCUSED, FormLimits, receive_form
-from service.api.cursors import cursor_after, name_of
+from service.api.cursors import Cursor, Limit, cursor_after, name_of
 from service.api.dependencies import CalibrationsDep, IdempotencyKey, RunnerDep, SettingsDep, SpoolDep, require_json
 from service.api.openapi import REF
 from service.api.preferences import MOST_WAIT_S, wait_of
@@ -138,8 +138,8 @@ async def create_calibration(
 )
 def list_calibrations(
     calibrations: CalibrationsDep,
-    limit: Annotated[int, Query(ge=1, le=200)] = 50,
-    cursor: Annotated[str | None, Query(max_length=200, description="`next_cursor` of the page before")] = None,
+    limit: Limit = 50,
+    cursor: Cursor = None,
 ) -> CalibrationPage:
     """Calibrations a page at a time, without images and results."""
     summaries, has_more = calibrations.page(limit, name_of(cursor, ID_PATTERN))

@@ -1,4 +1,4 @@
-"""``/cameras``: register, read, replace, delete, list, and the blur curve of a camera."""
+"""``/cameras``: preview, register, read, replace, delete, list, and a camera's revisions and blur curve."""
 
 import re
 from typing import Annotated
@@ -6,7 +6,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
-from service.api.cursors import cursor_after, name_of
+from service.api.cursors import Cursor, Limit, cursor_after, name_of
 from service.api.dependencies import CamerasDep, IdempotencyKey, SettingsDep, require_json
 from service.api.problems import STORE_ERRORS, WRITE_ERRORS, responses
 from service.api.schemas import (
@@ -84,8 +84,8 @@ def create_camera(
 )
 def list_cameras(
     cameras: CamerasDep,
-    limit: Annotated[int, Query(ge=1, le=200)] = 50,
-    cursor: Annotated[str | None, Query(max_length=200, description="`next_cursor` of the page before")] = None,
+    limit: Limit = 50,
+    cursor: Cursor = None,
 ) -> CameraPage:
     """Cameras at their current revisions, a page at a time."""
     records, has_more = cameras.page(limit, name_of(cursor))
@@ -172,8 +172,8 @@ def delete_camera(name: str, cameras: CamerasDep, if_match: IfMatch = None) -> N
 def list_revisions(
     name: str,
     cameras: CamerasDep,
-    limit: Annotated[int, Query(ge=1, le=200)] = 50,
-    cursor: Annotated[str | None, Query(max_length=200, description="`next_cursor` of the page before")] = None,
+    limit: Limit = 50,
+    cursor: Cursor = None,
 ) -> RevisionPage:
     """What the camera was at every revision, those of a deleted camera of this name among them."""
     before = name_of(cursor, REVISION_PATTERN)

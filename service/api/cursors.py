@@ -1,17 +1,25 @@
-"""List cursors: opaque to clients, and checked when they come back."""
+"""Pages of lists: their cursors are opaque to clients, and checked when they come back."""
 
 import re
 from base64 import urlsafe_b64decode, urlsafe_b64encode
+from typing import Annotated
+
+from fastapi import Query
+from pydantic import Field
 
 from service.errors import BadRequest, FieldProblem
 from service.storage.cameras import NAME_PATTERN
 
 PREFIX = "after:"
 
+Limit = Annotated[int, Query(ge=1, le=200)]
+Cursor = Annotated[str | None, Query(max_length=200, description="`next_cursor` of the page before")]
+NextCursor = Annotated[str | None, Field(description="Pass it as `cursor` for the next page; null: the last")]
 
-def cursor_after(name: str | int) -> str:
-    """A cursor for what comes behind the name, or the number."""
-    return urlsafe_b64encode(f"{PREFIX}{name}".encode()).decode().rstrip("=")
+
+def cursor_after(last: str | int) -> str:
+    """A cursor for what comes behind the last name, id or number."""
+    return urlsafe_b64encode(f"{PREFIX}{last}".encode()).decode().rstrip("=")
 
 
 def name_of(cursor: str | None, pattern: str = NAME_PATTERN) -> str | None:

@@ -119,7 +119,7 @@ async def estimate_depth(
     chosen = choose_format(query.format, request.headers.get("accept"), FORMAT_TYPES)
     upload = await receive_photograph(request, settings.max_image_bytes)
     record = await run_in_threadpool(cameras.get, query.camera)
-    camera, warnings = _focused(record.with_focal_length, query.focus_distance_m)
+    camera, warnings = _focused(record.draft.with_focal_length, query.focus_distance_m)
     limits = ImageLimits.of(settings)
     order = Order(upload, record, camera, query, chosen, limits, warnings)
     outcome = await unless_gone(request, worker.run(fulfil, order, estimator))

@@ -19,6 +19,7 @@ from service.errors import BadRequest, Busy, InvalidImage, NotFound, TooLarge, U
 from service.inference.cancellation import Cancellation
 from service.inference.drafting import draft_camera
 from service.inference.exif import read_exif
+from service.inference.frame import stored_camera_of
 from service.inference.headers import read_header
 from service.inference.images import ImageLimits, read_stored_frame
 from service.optics.camera import Camera, Intrinsics, Lens
@@ -56,7 +57,7 @@ async def look_at_photograph(
     Distance and tilt need a focal length: that of the camera if it is given and known, else that of the EXIF.
     """
     upload = await receive_photograph(request, settings.max_image_bytes)
-    known = (await run_in_threadpool(cameras.get, camera)).with_focal_length if camera else None
+    known = (await run_in_threadpool(cameras.get, camera)).draft.with_focal_length if camera else None
     order = Order(upload.data, grid, known, ImageLimits.of(settings))
     return (await unless_gone(request, worker.run(fulfil, order))).value
 
@@ -66,18 +67,21 @@ def fulfil(cancellation: Cancellation, order: Order) -> LookRead:
     rgb = read_stored_frame(order.data, order.limits)
     cancellation.check()
     height_px, width_px = rgb.shape[:2]
-    intrinsics, source = _intrinsics(order, width_px, height_px)
+    orientation = read_header(order.data).orientation
+    intrinsics, source = _intrinsics(order, width_px, height_px, orientation)
     seen = look(rgb, order.grid, intrinsics, cancellation.check)
-    return LookRead.from_look(seen, read_header(order.data).orientation, source if seen.distance_m else None)
+    return LookRead.from_look(seen, orientation, source if seen.distance_m else None)
 
 
-def _intrinsics(order: Order, width_px: int, height_px: int) -> tuple[Intrinsics | None, FocalLengthFrom | None]:
+def _intrinsics(
+    order: Order, width_px: int, height_px: int, orientation: int
+) -> tuple[Intrinsics | None, FocalLengthFrom | None]:
     """Those of the camera at the stored frame's size, else what the EXIF tells of the lens."""
-    for camera in (order.camera, order.camera and order.camera.turned(True, False, False)):
-        if camera is not None and camera.intrinsics is not None and camera.is_same_frame(width_px, height_px):
-            return camera.resized(width_px, height_px).intrinsics, "camera"
+    camera = order.camera and stored_camera_of(order.camera, width_px, height_px, orientation)
+    if camera and camera.intrinsics:
+        return camera.intrinsics, "camera"
     guess = draft_camera(read_exif(order.data), width_px, height_px).lens
     if guess.focal_length_mm is None or guess.pixel_pitch_um is None:
         return None, None
-    fx_px = Lens(guess.focal_length_mm, 1.0, guess.pixel_pitch_um, guess.sensor_width_px).fx_px(width_px)
-    return Intrinsics(fx_px, fx_px, (width_px - 1) / 2, (height_px - 1) / 2), "exif"
+    lens = Lens(guess.focal_length_mm, 1.0, guess.pixel_pitch_um, guess.sensor_width_px)
+    return Intrinsics.centred(lens.fx_px(width_px), width_px, height_px), "exif"

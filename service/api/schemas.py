@@ -5,6 +5,7 @@ from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
+from service.api.cursors import NextCursor
 from service.errors import BadRequest, FieldProblem
 from service.optics.camera import Camera, Intrinsics, Lens
 from service.storage.cameras import DEFAULT_K_R, NAME_PATTERN, CameraDraft, CameraRecord, Source
@@ -260,14 +261,14 @@ class CameraPage(BaseModel):
     """Cameras by name."""
 
     items: list[CameraRead]
-    next_cursor: Annotated[str | None, Field(description="Pass it as `cursor` for the next page; null: the last")]
+    next_cursor: NextCursor
 
 
 class RevisionPage(BaseModel):
     """A camera's revisions, the newest first; the times of each are those when it was written."""
 
     items: list[CameraRead]
-    next_cursor: Annotated[str | None, Field(description="Pass it as `cursor` for the next page; null: the last")]
+    next_cursor: NextCursor
 
 
 class CurvePoint(BaseModel):
@@ -322,9 +323,8 @@ def _fault(pointer: str, detail: str) -> BadRequest:
 
 
 def _fx_px(draft: CameraDraft) -> float | None:
-    if draft.camera.intrinsics:
-        return draft.camera.intrinsics.fx_px
-    return draft.lens.fx_px(draft.camera.image_width_px) if draft.lens else None
+    known = draft.with_focal_length.intrinsics
+    return known.fx_px if known else None
 
 
 def _lens_read(lens: Lens | None) -> LensSpecs | None:

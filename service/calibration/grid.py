@@ -6,7 +6,7 @@ pattern in every rotation.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,10 +64,11 @@ class _Blobs:
     tree: cKDTree
 
 
-def find_grid(grey: NDArray[np.uint8], grid: CircleGrid) -> FoundGrid:
+def find_grid(grey: NDArray[np.uint8], grid: CircleGrid, check: Callable[[], None] = lambda: None) -> FoundGrid:
     """The grid in a grey picture [h,w]. Raises ``GridError`` that says what is wrong with the picture.
 
-    Looks at a small copy first, in which blur is small too, and at larger ones for small circles.
+    Looks at a small copy first, in which blur is small too, and at larger ones for small circles. ``check`` is called
+    again and again and may raise to stop the work.
     """
     nearest = GridError(NOTHING)
     longest = max(grey.shape)
@@ -75,7 +76,7 @@ def find_grid(grey: NDArray[np.uint8], grid: CircleGrid) -> FoundGrid:
     while True:
         ratio = side / longest
         try:
-            found = _find(_smaller(grey, ratio), grid)
+            found = _find(_smaller(grey, ratio), grid, check)
         except GridError as error:
             nearest = error if _says_more(error, nearest) else nearest
         else:
@@ -132,12 +133,14 @@ def radii_px(grid: CircleGrid, centres_px: Array) -> Array:
     return np.asarray(np.sqrt(area) * grid.diameter_mm / 2)
 
 
-def _find(grey: NDArray[np.uint8], grid: CircleGrid) -> FoundGrid:
+def _find(grey: NDArray[np.uint8], grid: CircleGrid, check: Callable[[], None]) -> FoundGrid:
+    check()
     blobs = _blobs(grey)
     wanted = _lattice_cells(grid)
     best: dict[Cell, int] = {}
     tries = 0
     for first, u, v in _seeds(blobs):
+        check()
         cells = _grown(blobs, first, u, v)
         if len(cells) > len(best):
             best = cells

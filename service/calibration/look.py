@@ -1,5 +1,6 @@
 """One photograph of the sheet looked at on its own, while the next one can still be taken better."""
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,7 +8,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from service.calibration.measure import CLIPPED_LEVEL, Measured, measure
 from service.calibration.pose import View, stand
@@ -36,8 +36,8 @@ class Circle:
 class Look:
     """What one photograph shows; None for what it does not tell.
 
-    ``circles`` are all of the grid, row by row, those too that were filled in from their neighbours. A dozen of them,
-    evenly chosen, are measured; ``measured`` gave a blur, and ``blur_px`` is its median. ``paper_level`` is how bright
+    ``circles`` are all of the grid, row by row, those too that were filled in from their neighbours. At most a dozen,
+    in all columns, are measured; ``measured`` gave a blur, and ``blur_px`` is its median. ``paper_level`` is how bright
     the white between them is, 0 to 1.
     """
 
@@ -66,8 +66,7 @@ def look(
     """
     height_px, width_px = rgb.shape[:2]
     seen = Measured(PictureReport("", "defocused", found=False))
-    with threadpool_limits(1, "blas"):  # the sums are small: more threads would wait for each other
-        measure(seen, rgb, grid, lambda _: check(), every=math.ceil(grid.rows * grid.columns / MOST_MEASURED))
+    measure(seen, rgb, grid, lambda _: check(), every=_stride(grid))
     if seen.grid is None:
         return Look(width_px, height_px, warnings=seen.report.warnings)
     distance_m, tilt_deg = None, None
@@ -87,6 +86,12 @@ def look(
         paper_level=float(np.median(seen.paper_levels)) / WHITE_LEVEL,
         warnings=seen.report.warnings,
     )
+
+
+def _stride(grid: CircleGrid) -> int:
+    """The step that visits at most a dozen circles, and every column in turn."""
+    least = math.ceil(grid.rows * grid.columns / MOST_MEASURED)
+    return next(step for step in itertools.count(least) if math.gcd(step, grid.columns) == 1)
 
 
 def _exposure(paper_levels: list[float]) -> Exposure:

@@ -32,7 +32,7 @@ class Measured:
     centres_px: list[tuple[float, float]] = field(default_factory=list)
     edges: list[EdgeFit] = field(default_factory=list)
     slices_px: list[float] = field(default_factory=list)  # lambda as the paper reads it, if asked for
-    paper_levels: list[float] = field(default_factory=list)  # of the white around every circle, 0 to 255
+    paper_levels: list[float] = field(default_factory=list)  # of the white around each circle looked at, 0 to 255
 
     def view(self) -> View:
         return View(np.array(self.circles, np.int64), np.array(self.centres_px, np.float64))
@@ -63,7 +63,7 @@ def measure(
     grey = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
     at(0.05)
     try:
-        out.grid = find_grid(grey, grid)
+        out.grid = find_grid(grey, grid, lambda: at(0.05))
     except GridError as error:
         out.warn(str(error))
         if partner is None or partner.grid is None or partner.size_px != out.size_px:

@@ -73,7 +73,7 @@ def draft_camera(exif: Exif, width_px: int, height_px: int) -> Draft:
         lens=LensGuess(
             exif.focal_length_mm,
             exif.f_number,
-            width_mm and round(1e3 * width_mm / sensor_width_px, 4),
+            width_mm and (round(1e3 * width_mm / sensor_width_px, 4) or None),
             sensor_width_px,
         ),
         warnings=tuple(warnings),

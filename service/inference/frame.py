@@ -4,6 +4,18 @@ from service.errors import ImageSizeMismatch
 from service.inference.images import TURNS, Photograph
 from service.optics.camera import Camera
 
+UNTURNS = {orientation: {6: 8, 8: 6}.get(orientation, orientation) for orientation in TURNS}
+
+
+def stored_camera_of(camera: Camera, width_px: int, height_px: int, orientation: int) -> Camera | None:
+    """The camera at the size of a stored frame that is shown in this orientation; None where it is another's.
+
+    A camera is registered with the size of its files or with that of its upright pictures.
+    """
+    unturned = camera.turned(*TURNS[UNTURNS[orientation]])
+    fitting = next((one for one in (camera, unturned) if one.is_same_frame(width_px, height_px)), None)
+    return fitting and fitting.resized(width_px, height_px)
+
 
 def camera_of(photograph: Photograph, camera: Camera) -> tuple[Camera, tuple[str, ...]]:
     """The camera turned and resized like the upright photograph, with warnings.

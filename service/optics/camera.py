@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from typing import Self
 
 from service.optics import thin_lens
 
@@ -49,6 +50,11 @@ class Intrinsics:
     cx_px: float
     cy_px: float
     distortion: tuple[float, ...] = ()
+
+    @classmethod
+    def centred(cls, fx_px: float, width_px: int, height_px: int) -> Self:
+        """Square pixels, the axis in the middle of the picture, no distortion."""
+        return cls(fx_px, fx_px, (width_px - 1) / 2, (height_px - 1) / 2)
 
     def scaled(self, x_ratio: float, y_ratio: float) -> "Intrinsics":
         """The same camera after a resize by these ratios; distortion has no unit and stays."""
@@ -163,9 +169,8 @@ class Camera:
 
     def seen_through(self, lens: Lens) -> "Camera":
         """The same camera with the intrinsics its lens implies: square pixels, the axis in the middle."""
-        fx_px = lens.fx_px(self.image_width_px)
-        centre = ((self.image_width_px - 1) / 2, (self.image_height_px - 1) / 2)
-        return replace(self, intrinsics=Intrinsics(fx_px, fx_px, *centre))
+        size_px = (self.image_width_px, self.image_height_px)
+        return replace(self, intrinsics=Intrinsics.centred(lens.fx_px(self.image_width_px), *size_px))
 
     def blur_px(self, depth_m: float) -> float:
         """lambda this camera shows at a depth."""

@@ -43,6 +43,11 @@ class CameraDraft:
         """Diameter of the circle of confusion over the standard deviation that k_cam stands for."""
         return self.lens.k_r if self.lens else DEFAULT_K_R
 
+    @property
+    def with_focal_length(self) -> Camera:
+        """The camera with intrinsics where its lens tells them, the principal point in the middle."""
+        return self.camera.seen_through(self.lens) if self.lens and self.camera.intrinsics is None else self.camera
+
 
 @dataclass(frozen=True, slots=True)
 class CameraRecord:
@@ -60,12 +65,6 @@ class CameraRecord:
     @property
     def camera(self) -> Camera:
         return self.draft.camera
-
-    @property
-    def with_focal_length(self) -> Camera:
-        """The camera with intrinsics where its lens tells them, the principal point in the middle."""
-        camera, lens = self.camera, self.draft.lens
-        return camera.seen_through(lens) if lens and camera.intrinsics is None else camera
 
 
 class Cameras:

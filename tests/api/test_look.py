@@ -10,17 +10,20 @@ from httpx2 import Response
 from numpy.typing import NDArray
 from starlette.testclient import TestClient
 
+from service.inference.images import TURNS
+from service.optics.camera import Camera, Intrinsics
 from tests.inference.photographs import corners, exif_of, jpeg, png, with_exif
 from tests.simulated_sheets import CAMERA, GRID, shots
 
 Z_M = 0.4
+AXIS: dict[str, Any] = {"fx_px": 900, "fy_px": 900, "cx_px": 400, "cy_px": 300, "distortion": [-0.05, 0.02, 0, 0, 0]}
 KNOWN = {
     "name": "bench",
     "image_width_px": 800,
     "image_height_px": 600,
     "focus_distance_m": 0.5,
     "k_cam_px": 4.0,
-    "intrinsics": {"fx_px": 900, "fy_px": 900, "cx_px": 400, "cy_px": 300, "distortion": [-0.05, 0.02, 0, 0, 0]},
+    "intrinsics": AXIS,
 }
 
 
@@ -77,9 +80,32 @@ def test_a_photograph_without_the_sheet_says_so(client: TestClient) -> None:
     assert "no grid" in seen["warnings"][0]
 
 
-def test_circles_are_of_the_stored_frame_and_the_turn_is_told(client: TestClient) -> None:
-    seen = look(client, jpeg(corners(200, 150), orientation=6)).json()
-    assert (seen["orientation"], seen["width_px"], seen["height_px"]) == (6, 150, 200)
+def test_circles_are_of_the_stored_frame_and_the_turn_is_told(client: TestClient, sheet: NDArray[np.uint8]) -> None:
+    plain, turned = (look(client, jpeg(sheet, orientation=n)).json() for n in (1, 6))
+    assert (turned["orientation"], turned["width_px"], turned["height_px"]) == (6, 800, 600)
+    assert turned["circles"] == plain["circles"] != []
+
+
+def test_a_camera_registered_upright_stands_where_one_of_the_file_s_size_does(
+    client: TestClient, sheet: NDArray[np.uint8]
+) -> None:
+    client.post("/cameras", json=KNOWN)
+    stored = Intrinsics(**AXIS)
+    upright = Camera(800, 600, 0.5, 4.0, intrinsics=stored).turned(*TURNS[6])
+    assert upright.intrinsics is not None
+    told = {"image_width_px": 600, "image_height_px": 800, "intrinsics": asdict(upright.intrinsics)}
+    client.post("/cameras", json=KNOWN | told | {"name": "upright"})
+    as_filed, as_shown = (look(client, jpeg(sheet, orientation=6), camera=name).json() for name in ("bench", "upright"))
+    assert as_filed["focal_length_from"] == "camera"
+    assert (as_shown["distance_m"], as_shown["tilt_deg"]) == pytest.approx(
+        (as_filed["distance_m"], as_filed["tilt_deg"]), rel=1e-6
+    )
+
+
+def test_an_exif_that_makes_pixels_of_no_size_has_no_focal_length(client: TestClient, sheet: NDArray[np.uint8]) -> None:
+    taken = with_exif(jpeg(sheet), exif_of({}, {0x920A: (50, 1), 0xA405: 50, 0xA002: 4_000_000_000}))
+    seen = look(client, taken).json()
+    assert (seen["found"], seen["focal_length_from"]) == (True, None)
 
 
 def test_what_cannot_be_looked_at_is_refused(client: TestClient) -> None:

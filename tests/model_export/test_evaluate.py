@@ -85,6 +85,13 @@ def test_intervals_hold_what_lies_within_them() -> None:
     assert pixels.within(2) == 0.75
 
 
+def test_what_has_no_answer_is_in_no_interval() -> None:
+    filled = np.array([1.0, 1.0, 1.0], np.float32)
+    pixels = Pixels(np.array([1.05, 1.5, 9.0], np.float32), filled, np.array([0.1, 0.1, np.inf], np.float32))
+    assert pixels.within(1) == 0.5
+    assert np.isnan(Pixels(filled, filled, np.full(3, np.inf, np.float32)).within(1))
+
+
 def test_the_temperature_makes_intervals_hold_what_they_promise() -> None:
     rng = np.random.default_rng(1)
     told = np.full(20_000, 0.04, np.float32)

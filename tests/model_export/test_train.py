@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from io import StringIO
 from pathlib import Path
 
@@ -13,10 +14,20 @@ from rich.console import Console
 
 from model_export.config import SceneConfig, TrainConfig
 from model_export.folded import folded
-from model_export.restored import restored
+from model_export.losses import run_pair
+from model_export.restored import restored, spread_norms
 from model_export.scenes import draw_sample
 from model_export.textures import load_photographs
-from model_export.train import Checkpoint, Pool, Trainer, collate, learning_rate, settling_step, train
+from model_export.train import (
+    Checkpoint,
+    Pool,
+    Trainer,
+    collate,
+    learning_rate,
+    settling_step,
+    starting_pair,
+    train,
+)
 
 SHIPPED = Path(__file__).parents[2] / "service" / "models"
 SCENES = SceneConfig(size_px=32, margin_px=8)
@@ -72,17 +83,20 @@ def test_the_mean_of_two_checkpoints_lies_between_them(textures: Path, tmp_path:
 def test_a_new_run_begins_with_the_weights_it_is_told(textures: Path, tmp_path: Path) -> None:
     first, _ = run(CONFIG, textures, tmp_path / "first")
     trainer = Trainer(replace(CONFIG, seed=2), "cpu")
-    trainer.begin_with(tmp_path / "first" / "checkpoint.pt", [])
+    trainer.begin_with(starting_pair(tmp_path / "first" / "checkpoint.pt", "compact"))
     assert trainer.step == 0
     torch.testing.assert_close(trainer.modules.state_dict(), first.modules)
-    with pytest.raises(ValueError, match="do not fit"):
-        Trainer(replace(CONFIG, kind="paper"), "cpu").begin_with(tmp_path / "first" / "checkpoint.pt", [])
+    for weights in (tmp_path / "first" / "checkpoint.pt", SHIPPED):
+        with pytest.raises(ValueError, match="do not fit"):
+            starting_pair(weights, "paper")
 
 
 def test_a_new_run_goes_on_from_a_model_folder() -> None:
     batch = collate([draw_sample(seed, SCENES, []) for seed in range(2)], np.random.default_rng(0))
     trainer = Trainer(CONFIG, "cpu")
-    trainer.begin_with(SHIPPED, [batch])
+    start = starting_pair(SHIPPED, "compact")
+    spread_norms(start, [partial(run_pair, start, batch)])
+    trainer.begin_with(start)
     begun, shipped = folded(trainer.pair).modules(), folded(restored(SHIPPED)).modules()
     torch.testing.assert_close(begun.state_dict(), shipped.state_dict(), rtol=1e-3, atol=1e-4)
 

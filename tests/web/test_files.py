@@ -10,6 +10,7 @@ from service.api.pages import KINDS, PAGE, WEB
 from tests.web import pictures
 
 MOST_BYTES = 250_000
+ROOT = WEB.parents[1]
 PROBLEM = "application/problem+json"
 FILES = sorted(path for path in WEB.rglob("*") if path.is_file())
 # types are for whoever writes the page
@@ -57,8 +58,8 @@ def test_a_file_comes_with_its_kind_and_the_pages_policy(client: TestClient, pat
         "/web/vendor",
         "/web/vendor/preact.d.ts",
         "/web/%2e%2e/app.py",
-        "/web/..%2f..%2fservice/app.py",
-        "/web//etc/hostname.txt",
+        "/web/..%2f..%2frequirements%2fservice.txt",
+        f"/web/{ROOT / 'requirements/service.txt'}",
         "/web/%00.js",
         f"/web/{'x' * 5000}.js",
     ],

@@ -1,0 +1,47 @@
+"""A look at one photograph of the sheet: a few circles stand for all of it."""
+
+import numpy as np
+import pytest
+
+from model_export.grids import GridCamera, draw_pose, photograph
+from service.calibration.look import MOST_MEASURED, look
+from service.calibration.measure import Measured, measure
+from service.calibration.report import PictureReport
+from service.calibration.target import CircleGrid
+from service.optics.camera import Intrinsics
+
+CAMERA = GridCamera(800, 600, 12.0, 0.7, 0.5, Intrinsics(900, 900, 400, 300))
+SHEETS = (CircleGrid("asymmetric_circles", 11, 4, 12.0, 8.0), CircleGrid("symmetric_circles", 6, 6, 22.0, 12.0))
+
+
+@pytest.mark.parametrize("sheet", SHEETS, ids=lambda sheet: sheet.kind)
+def test_the_blur_of_a_few_circles_is_that_of_all(sheet: CircleGrid) -> None:
+    rng = np.random.default_rng(3)
+    taken = photograph(rng, CAMERA, draw_pose(rng, CAMERA, sheet, 0.42), sheet, focused=False)
+    whole = Measured(PictureReport("", "defocused", found=False))
+    measure(whole, taken, sheet, lambda _: None)
+    # the sheet leans: its blur differs from end to end
+    assert np.ptp(whole.blur_px()) > 0.1 * np.median(whole.blur_px())
+    seen = look(taken, sheet, None)
+    assert 0.6 * MOST_MEASURED <= seen.measured <= MOST_MEASURED
+    assert seen.blur_px == pytest.approx(np.median(whole.blur_px()), rel=0.04)
+
+
+def test_a_look_stops_while_it_searches_for_the_sheet() -> None:
+    calls = 0
+
+    class Stopped(Exception):
+        pass
+
+    def check() -> None:
+        nonlocal calls
+        calls += 1
+        if calls == 4:
+            raise Stopped
+
+    dots = np.full((480, 640, 3), 255, np.uint8)
+    for v in range(20, 460, 24):
+        for u in range(20, 620, 24):
+            dots[v : v + 9, u : u + 9] = 0
+    with pytest.raises(Stopped):
+        look(dots, SHEETS[0], None, check)
