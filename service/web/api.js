@@ -159,17 +159,46 @@ export async function request(path, options = {}) {
 }
 
 /**
+ * An answer with its body, which may break off too.
+ *
+ * @param {"json" | "blob" | "text"} kind
  * @param {string} path
  * @param {RequestOptions} [options]
  * @returns {Promise<any>}
  */
-export async function getJson(path, options = {}) {
+async function read(kind, path, options) {
   const answer = await request(path, options);
   try {
-    return await answer.json();
+    return await answer[kind]();
   } catch (error) {
     throw asProblem(error);
   }
+}
+
+/** @param {string} path @param {RequestOptions} [options] @returns {Promise<any>} */
+export const getJson = (path, options) => read("json", path, options);
+
+/** @param {string} path @param {RequestOptions} [options] @returns {Promise<Blob>} */
+export const getBlob = (path, options) => read("blob", path, options);
+
+/** @param {string} path @param {RequestOptions} [options] @returns {Promise<string>} */
+export const getText = (path, options) => read("text", path, options);
+
+/** @param {string} path @param {unknown} body @param {RequestOptions} [options] @returns {Promise<any>} */
+export function sendJson(path, body, { method = "POST", headers = {}, ...options } = {}) {
+  const about = { ...headers, "Content-Type": "application/json" };
+  return getJson(path, { ...options, method, headers: about, body: JSON.stringify(body) });
+}
+
+/**
+ * @param {any} camera
+ * @param {number | null} revision that it replaces; null for a new camera
+ * @returns {Promise<any>} the camera as it is stored
+ */
+export function storeCamera(camera, revision) {
+  if (revision === null) return sendJson("cameras", camera);
+  const headers = { "If-Match": `"${revision}"` };
+  return sendJson(`cameras/${encodeURIComponent(camera.name)}`, camera, { method: "PUT", headers });
 }
 
 /** @returns {Promise<any[]>} the cameras as they are now, by name */
@@ -245,7 +274,7 @@ function sendWithProgress(path, { method = "POST", headers = {}, body = null, si
  * @param {{signal?: AbortSignal, onEvent: (event: {event: string, data: string}) => void}} options
  */
 export async function events(path, { signal, onEvent }) {
-  const answer = await request(path, { signal, headers: { Accept: "text/event-stream" } });
+  const answer = await request(path, { signal, asks: false, headers: { Accept: "text/event-stream" } });
   const reader = /** @type {ReadableStream<Uint8Array>} */ (answer.body).getReader();
   const decoder = new TextDecoder();
   let text = "";
@@ -273,7 +302,7 @@ function readEvent(block, onEvent) {
   const data = [];
   let event = "message";
   for (const line of block.split("\n")) {
-    const [, name, value] = /^([^:]*):? ?(.*)$/.exec(line) ?? [];
+    const [, name, value] = /^([^:]*):? ?(.*)$/s.exec(line) ?? [];
     if (name === "event") event = value;
     if (name === "data") data.push(value);
   }

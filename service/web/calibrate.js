@@ -1,13 +1,13 @@
 /** The calibration, step by step: print a sheet, photograph it, wait, and accept what was found. */
 
-import { Problem, events, getJson, problemOf, upload } from "./api.js";
+import { Problem, events, getJson, problemOf, storedKey, upload } from "./api.js";
 import { Ended, Running } from "./job_step.js";
-import { when } from "./numbers.js";
+import { decimal, when } from "./numbers.js";
 import { Photographs, useLooks } from "./photo_step.js";
 import { ProblemBox } from "./problem_box.js";
 import { SHEET, SheetStep, isMeasured, patternOf } from "./sheet_step.js";
 import { TextField } from "./text_field.js";
-import { html, useEffect, useMemo, useRef, useState } from "./vendor/preact.js";
+import { html, useEffect, useRef, useState } from "./vendor/preact.js";
 
 const STEPS = ["Sheet", "Photographs", "Calibration", "Result"];
 const RECENT = 10;
@@ -34,15 +34,13 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
   const requestKey = useRef("");
   const known = cameras?.find((one) => one.name === name.trim()) ?? null;
   const focusM = toMetres(focus);
-  const query = useMemo(() => {
-    const about = new URLSearchParams(Object.entries(patternOf(sheet)).map(([field, value]) => [field, String(value)]));
-    if (known) about.set("camera", known.name);
-    return isMeasured(sheet) ? String(about) : "";
-  }, [sheet, known?.name, known?.revision]);
+  const about = new URLSearchParams(Object.entries(patternOf(sheet)).map(([field, value]) => [field, String(value)]));
+  if (known) about.set("camera", known.name);
+  const query = isMeasured(sheet) ? String(about) : "";
 
   useLooks(photos, setPhotos, query);
   useJob(job, setJob, setProblem, (done) => {
-    announce(done.state === "succeeded" ? "The calibration has succeeded." : `The calibration has ${done.state}.`);
+    announce(`The calibration ${done.state === "cancelled" ? "is" : "has"} ${done.state}.`);
     move(3);
     if (done.camera_revision !== null) reloadCameras();
   });
@@ -61,10 +59,10 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
   }, [shown, camera]);
   useEffect(() => {
     requestKey.current = "";
-  }, [photos, query, name, focus]);
+  }, [photos.map(({ id, role }) => id + role).join(), query, name, focus]);
   useEffect(() => {
     if (shown) loadRecent();
-  }, [shown, job?.state, job?.camera_revision]);
+  }, [shown, job?.state, job?.camera_revision, storedKey()]);
 
   async function loadRecent() {
     try {
@@ -100,12 +98,12 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
     setSent(0);
     try {
       const { body } = await upload(`calibrate?camera=${encodeURIComponent(name.trim())}`, {
-        method: "POST",
         body: form,
         headers: { "Idempotency-Key": requestKey.current },
         responseType: "json",
         onProgress: setSent,
       });
+      requestKey.current = "";
       setJob(body);
       move(2);
     } catch (error) {
@@ -117,8 +115,8 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
 
   const isSending = sent !== undefined;
   const reached = job !== null ? (FINAL.has(job.state) ? 3 : 2) : 1;
-  const focusFault = (problem?.errors ?? []).find(({ pointer }) => pointer === "#/settings/focus_distance_m")?.detail;
-  const nameFault = (problem?.errors ?? []).find(({ pointer }) => pointer === "camera")?.detail;
+  const focusFault = problem?.errors.find(({ pointer }) => pointer === "#/settings/focus_distance_m")?.detail;
+  const nameFault = problem?.errors.find(({ pointer }) => pointer === "camera")?.detail;
   return html`
     <div class="stack">
       <h2 tabindex="-1" ref=${title}>Calibrate<span class="visually-hidden">, step ${step + 1}: ${STEPS[step]}</span></h2>
@@ -169,17 +167,18 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
           <button
             type="button"
             class="primary"
-            disabled=${isSending || focusM === undefined || name.trim() === "" || !photos.some(({ role }) => role === "defocused")}
+            disabled=${isSending || !query || focusM === undefined || name.trim() === "" || !photos.some(({ role }) => role === "defocused")}
             onClick=${start}
           >
             Start the calibration
           </button>
           ${name.trim() === "" && photos.length > 0 && html`<span class="hint">Name the camera first.</span>`}
+          ${!query && html`<span class="hint">Say on the sheet's page how long its ruler is.</span>`}
           ${isSending &&
           html`<label class="sending hint">Sending the photographs ... <progress max="1" value=${sent ?? undefined}></progress></label>`}
         </div>
       `}
-      ${step === 2 && job && html`<${Running} job=${job} onCancelled=${() => announce("The calibration is cancelled.")} />`}
+      ${step === 2 && job && html`<${Running} job=${job} />`}
       ${step === 3 &&
       job &&
       html`<${Ended}
@@ -257,6 +256,7 @@ function useJob(job, setJob, setProblem, onEnd) {
     const stop = new AbortController();
     const follow = async () => {
       while (!stop.signal.aborted) {
+        let waitMs = AGAIN_MS;
         try {
           await events(`calibrations/${live}/events`, {
             signal: stop.signal,
@@ -274,9 +274,10 @@ function useJob(job, setJob, setProblem, onEnd) {
           if (stop.signal.aborted) return;
           const problem = problemOf(error);
           setProblem(problem);
-          if (problem.status === 404) return;
+          if ([403, 404].includes(problem.status)) return;
+          waitMs = 1000 * (problem.retryAfterS ?? 1);
         }
-        await new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
+        await new Promise((resolve) => setTimeout(resolve, waitMs));
       }
     };
     follow();
@@ -287,7 +288,7 @@ function useJob(job, setJob, setProblem, onEnd) {
 /** @param {string} text @returns {number | null | undefined} null for none, undefined for what is no distance */
 function toMetres(text) {
   if (text.trim() === "") return null;
-  const value = Number(text.replace(",", "."));
+  const value = decimal(text);
   return Number.isFinite(value) && value > 0 ? value : undefined;
 }
 

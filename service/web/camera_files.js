@@ -1,12 +1,10 @@
 /** Cameras as files: all or one out, and back in after it is shown what that would do. */
 
-import { Problem, everyCamera, problemOf, request } from "./api.js";
+import { Problem, everyCamera, problemOf, sendJson, storeCamera } from "./api.js";
 import { differences, specsOf } from "./camera_specs.js";
 import { counted } from "./numbers.js";
 import { save } from "./save.js";
 import { html, useEffect, useRef, useState } from "./vendor/preact.js";
-
-const JSON_TYPE = { "Content-Type": "application/json" };
 
 /** @typedef {{camera: any, name: string, does: "create" | "update" | "nothing" | "refuse" | "done", words: string, revision: number | null}} Step */
 
@@ -38,6 +36,7 @@ export function ImportDialog({ file, onClose }) {
   async function carryOut() {
     setIsBusy(true);
     for (const step of wanted) {
+      if (!dialog.current?.open) return;
       const done = await stepDone(step);
       setSteps((before) => (before ?? []).map((one) => (one === step ? done : one)));
     }
@@ -117,7 +116,7 @@ async function planned(given, cameras) {
   // what the API answers has more than it takes
   const camera = "revision" in given ? specsOf(given) : given;
   try {
-    await request("cameras/preview", { method: "POST", headers: JSON_TYPE, body: JSON.stringify(camera) });
+    await sendJson("cameras/preview", camera);
   } catch (error) {
     if (error instanceof Problem && error.status === 422) return refused(given, error.detail);
     throw error;
@@ -138,18 +137,9 @@ function refused(given, words) {
 
 /** @param {Step} step @returns {Promise<Step>} */
 async function stepDone(step) {
-  const { camera, name, revision } = step;
-  const body = JSON.stringify(camera);
   try {
-    const answer =
-      revision === null
-        ? await request("cameras", { method: "POST", headers: JSON_TYPE, body })
-        : await request(`cameras/${encodeURIComponent(name)}`, {
-            method: "PUT",
-            headers: { ...JSON_TYPE, "If-Match": `"${revision}"` },
-            body,
-          });
-    return { ...step, does: "done", words: `as revision ${(await answer.json()).revision}` };
+    const { revision } = await storeCamera(step.camera, step.revision);
+    return { ...step, does: "done", words: `as revision ${revision}` };
   } catch (error) {
     return { ...step, does: "refuse", words: problemOf(error).detail };
   }

@@ -1,14 +1,14 @@
 /** A camera to fill in, new or for its next revision, with what its numbers come to while they are typed. */
 
-import { Problem, getJson, problemOf, request } from "./api.js";
+import { Problem, getJson, problemOf, sendJson, storeCamera } from "./api.js";
 import { CameraCurve } from "./camera_curve.js";
 import { BLANK, bodyOf, differences, fieldsOf, missingOf } from "./camera_specs.js";
+import { PHOTOGRAPHS, mediaTypeOf } from "./photograph_files.js";
 import { ProblemBox } from "./problem_box.js";
 import { TextField } from "./text_field.js";
 import { html, useEffect, useRef, useState } from "./vendor/preact.js";
 
 const WAIT_MS = 250;
-const JSON_TYPE = { "Content-Type": "application/json" };
 
 /** @typedef {import("./camera_specs.js").Fields} Fields */
 
@@ -41,16 +41,7 @@ export function CameraForm({ editing, onSaved, onCancel }) {
     setIsSaving(true);
     setProblem(null);
     try {
-      const body = JSON.stringify(bodyOf(fields));
-      const answer =
-        revision === null
-          ? await request("cameras", { method: "POST", headers: JSON_TYPE, body })
-          : await request(`cameras/${encodeURIComponent(base.name)}`, {
-              method: "PUT",
-              headers: { ...JSON_TYPE, "If-Match": `"${revision}"` },
-              body,
-            });
-      const camera = await answer.json();
+      const camera = await storeCamera(bodyOf(fields), revision);
       onSaved(camera, `Camera ${camera.name} is stored as revision ${camera.revision}.`);
     } catch (error) {
       if (!(error instanceof Problem)) throw error;
@@ -75,8 +66,8 @@ export function CameraForm({ editing, onSaved, onCancel }) {
     const file = input.files?.[0];
     if (!file) return;
     try {
-      const answer = await request("cameras/from-photo", { method: "POST", headers: { "Content-Type": file.type }, body: file });
-      const draft = await answer.json();
+      const headers = { "Content-Type": mediaTypeOf(file) };
+      const draft = await getJson("cameras/from-photo", { method: "POST", headers, body: file });
       setTold(draft.warnings);
       setFields((before) => ({ ...before, ...fieldsOf({ ...draft, name: before.name || draft.name }), by: "lens" }));
       setProblem(null);
@@ -91,7 +82,7 @@ export function CameraForm({ editing, onSaved, onCancel }) {
 
   return html`
     <form
-      class="card camera-form"
+      class="card"
       aria-labelledby="camera-form-title"
       onSubmit=${(/** @type {Event} */ event) => {
         event.preventDefault();
@@ -121,7 +112,7 @@ export function CameraForm({ editing, onSaved, onCancel }) {
       <${ProblemBox} problem=${problem} />
       <label class="field">
         Fill in from a photograph it took
-        <input type="file" accept="image/*,.dng,.cr2,.nef,.arw,.heic" onChange=${fillFromPhotograph} />
+        <input type="file" accept=${PHOTOGRAPHS} onChange=${fillFromPhotograph} />
         <span class="hint">Its EXIF tells lens and sensor. The photograph is not kept.</span>
       </label>
       ${told.length > 0 && html`<ul class="notice plain" role="status">${told.map((words) => html`<li>${words}</li>`)}</ul>`}
@@ -253,12 +244,12 @@ function usePreview(fields) {
     const stop = new AbortController();
     const timer = setTimeout(async () => {
       try {
-        const options = { method: "POST", headers: JSON_TYPE, body, signal: stop.signal, asks: false };
-        const answer = await request("cameras/preview", options);
-        setSeen({ preview: await answer.json(), faults: [] });
+        const preview = await sendJson("cameras/preview", JSON.parse(body), { signal: stop.signal, asks: false });
+        setSeen({ preview, faults: [] });
       } catch (error) {
         if (stop.signal.aborted) return;
-        setSeen({ preview: null, faults: error instanceof Problem ? error.errors : [] });
+        const { errors, detail } = problemOf(error);
+        setSeen({ preview: null, faults: errors.length ? errors : [{ pointer: "", detail }] });
       }
     }, WAIT_MS);
     return () => {

@@ -1,5 +1,7 @@
 /** A camera between its forms: what the API answers, what it takes, and the fields a person fills in. */
 
+import { decimal } from "./numbers.js";
+
 /** @typedef {Record<string, string>} Fields by the pointer's path: "lens/f_number" */
 
 const LENS = ["focal_length_mm", "f_number", "pixel_pitch_um", "sensor_width_px", "k_r"];
@@ -47,7 +49,7 @@ export function fieldsOf(camera) {
   else fill("k_cam_px", camera.k_cam_px);
   if (camera.intrinsics) {
     for (const name of PINHOLE) fill(`intrinsics/${name}`, camera.intrinsics[name]);
-    fill("intrinsics/distortion", camera.intrinsics.distortion.join(", "));
+    fill("intrinsics/distortion", (camera.intrinsics.distortion ?? []).join(", "));
   }
   return fields;
 }
@@ -102,6 +104,6 @@ export function differences(before, after) {
 
 /** @param {string} text */
 function toNumber(text) {
-  const value = Number(text.replace(",", "."));
+  const value = decimal(text);
   return Number.isNaN(value) ? text : value;
 }

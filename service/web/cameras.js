@@ -68,7 +68,7 @@ export function CamerasView({ shown, cameras, camera, reloadCameras, go, announc
           ${cameras === null && html`<p class="hint">Loading ...</p>`}
           ${cameras?.length === 0 &&
           html`<p>There is no camera yet. Make one from its lens specs, or <a href="#calibrate">measure it</a> with a printed sheet.</p>`}
-          ${(cameras?.length ?? 0) > A_PAGE / 2 &&
+          ${(filter || (cameras?.length ?? 0) > A_PAGE / 2) &&
           html`<label class="field">
             Find
             <input
@@ -120,6 +120,7 @@ export function CamerasView({ shown, cameras, camera, reloadCameras, go, announc
             go=${go}
             onEdit=${() => setOpen({ kind: "edit", camera: read })}
             onDeleted=${() => changed(null, `Camera ${read.name} is deleted.`)}
+            onStale=${reloadCameras}
           />`}
         </div>
       </div>
@@ -136,9 +137,10 @@ export function CamerasView({ shown, cameras, camera, reloadCameras, go, announc
 }
 
 /**
- * @param {{camera: any, go: import("./app.js").ViewProps["go"], onEdit: () => void, onDeleted: () => void}} props
+ * @param {{camera: any, go: import("./app.js").ViewProps["go"], onEdit: () => void, onDeleted: () => void,
+ *   onStale: () => void}} props `onStale` is for when the service has another revision
  */
-function CameraCard({ camera, go, onEdit, onDeleted }) {
+function CameraCard({ camera, go, onEdit, onDeleted, onStale }) {
   const path = `cameras/${encodeURIComponent(camera.name)}`;
   const { answer: curve, problem } = useAnswer(`${path}/curve`);
   const [isDeleting, setIsDeleting] = useState(false);
@@ -179,7 +181,7 @@ function CameraCard({ camera, go, onEdit, onDeleted }) {
         <button type="button" class="danger" onClick=${() => setIsDeleting(true)}>Delete</button>
       </div>
       <${Revisions} path=${`${path}/revisions`} />
-      ${isDeleting && html`<${DeleteDialog} camera=${camera} path=${path} onClose=${() => setIsDeleting(false)} onDeleted=${onDeleted} />`}
+      ${isDeleting && html`<${DeleteDialog} camera=${camera} path=${path} onClose=${() => setIsDeleting(false)} ...${{ onDeleted, onStale }} />`}
     </article>
   `;
 }
@@ -192,6 +194,7 @@ function Revisions({ path }) {
 
   /** @param {string | null} after */
   async function load(after) {
+    setCursor(null); // until the next is known
     try {
       const page = await getJson(`${path}?limit=${A_PAGE}${after ? `&cursor=${encodeURIComponent(after)}` : ""}`);
       setItems((before) => [...(after ? before : []), ...page.items]);
@@ -234,9 +237,9 @@ function changesOf(before, after) {
 }
 
 /**
- * @param {{camera: any, path: string, onClose: () => void, onDeleted: () => void}} props
+ * @param {{camera: any, path: string, onClose: () => void, onDeleted: () => void, onStale: () => void}} props
  */
-function DeleteDialog({ camera, path, onClose, onDeleted }) {
+function DeleteDialog({ camera, path, onClose, onDeleted, onStale }) {
   const dialog = useRef(/** @type {HTMLDialogElement | null} */ (null));
   const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
   useEffect(() => dialog.current?.showModal(), []);
@@ -257,7 +260,7 @@ function DeleteDialog({ camera, path, onClose, onDeleted }) {
       <div class="stack">
         <h2 id="delete-title">Delete ${camera.name}?</h2>
         <p>Photographs can no longer be sent with this camera. Its name is free again, and its revisions are kept.</p>
-        <${ProblemBox} problem=${problem} />
+        <${ProblemBox} problem=${problem} onRetry=${[404, 412].includes(problem?.status ?? 0) ? onStale : undefined} />
         <div class="row">
           <button type="button" class="danger" onClick=${remove}>Delete ${camera.name}</button>
           <button type="button" onClick=${() => dialog.current?.close()}>Keep it</button>

@@ -71,8 +71,8 @@ export function Chart({ title, x, y, series, marks = [] }) {
           </g>`,
         )}
         ${series.map((one) => drawn(one, across.scale, up.scale))}
-        <text class="name" x=${width - RIGHT} y=${HEIGHT - 6} text-anchor="end">${x.label} (${x.unit})</text>
-        <text class="name" x=${12} y=${TOP} transform=${`rotate(-90 12 ${TOP})`} text-anchor="end">
+        <text x=${width - RIGHT} y=${HEIGHT - 6} text-anchor="end">${x.label} (${x.unit})</text>
+        <text x=${12} y=${TOP} transform=${`rotate(-90 12 ${TOP})`} text-anchor="end">
           ${y.label} (${y.unit})
         </text>
       </svg>

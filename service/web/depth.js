@@ -7,6 +7,8 @@ import { Colours } from "./colour_controls.js";
 import { DraftForm } from "./draft_form.js";
 import { Exports } from "./exports.js";
 import { Legend } from "./legend.js";
+import { short } from "./numbers.js";
+import { PHOTOGRAPHS, mediaTypeOf } from "./photograph_files.js";
 import { ProblemBox } from "./problem_box.js";
 import { DepthReader } from "./reader.js";
 import { Distance, Readout, Timings, metres } from "./readout.js";
@@ -36,7 +38,6 @@ const SIDES = [
   ["far", "All beyond focus"],
 ];
 const PHOTOGRAPH_MOST_PX = 1600;
-const FILES = "image/*,.heic,.heif,.dng,.cr2,.nef,.arw";
 const NOT_THE_FRAME = "urn:camind:problem:image-size-mismatch";
 /** @type {Look} */
 const FIRST_LOOK = { map: "cividis", nearM: 1, farM: 2, hatchesNothing: true, dotsEither: true };
@@ -79,7 +80,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
     setPhotograph(null);
     setIsDrafting(false);
     setFile(taken);
-    setPhotograph(await reader.ask("photograph", { file: taken, mostPx: PHOTOGRAPH_MOST_PX }));
+    setPhotograph(await reader.ask("photograph", { file: taken, mostPx: PHOTOGRAPH_MOST_PX }).catch(() => null));
   }, []);
 
   useFilesFromOutside(shown, take);
@@ -99,7 +100,10 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
   }, [marks]);
 
   useEffect(() => {
-    if (file === null || camera === null) return undefined;
+    if (file === null || camera === null) {
+      setPhase(null);
+      return undefined;
+    }
     const abort = new AbortController();
     running.current = abort;
     run(file, abort.signal);
@@ -195,13 +199,13 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
           </p>`}
           <${Warnings} texts=${warned("camera")} />
         </div>
-        <label class="field depth-side"
+        <label class="field"
           >Side of the plane in focus
           <select value=${side} onChange=${(/** @type {any} */ event) => setSide(event.target.value)}>
             ${SIDES.map(([value, says]) => html`<option key=${value} value=${value}>${says}</option>`)}
           </select>
         </label>
-        <div class="stack depth-focus">
+        <div class="stack">
           <${FocusField} camera=${camera} onFocusM=${setFocusM} />
           <${Warnings} texts=${warned("focus")} />
         </div>
@@ -235,7 +239,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
       ${size === null
         ? html`<${DropPlace} file=${file} />`
         : html`<div class=${`depth-grid ${phase && result ? "depth-stale" : ""}`}>
-            <div class="stack depth-main">
+            <div class="stack">
               ${result &&
               html`<${PictureTabs} picture=${picture} onPicture=${setPicture} />`}
               <div
@@ -345,7 +349,7 @@ function FileButtons({ hasFile, onFile }) {
       ${hasFile ? "Another photograph" : "Choose a photograph"}
     </button>
     <button type="button" class="depth-take" onClick=${() => taken.current?.click()}>Take one</button>
-    <input ref=${chosen} type="file" accept=${FILES} hidden onChange=${onChange} />
+    <input ref=${chosen} type="file" accept=${PHOTOGRAPHS} hidden onChange=${onChange} />
     <input ref=${taken} type="file" accept="image/*" capture="environment" hidden onChange=${onChange} />
   </div>`;
 }
@@ -368,6 +372,7 @@ function FocusField({ camera, onFocusM }) {
         if (validity.valid) onFocusM(value === "" ? null : Number(value));
       }}
     />
+    ${isWrong && html`<span class="fault" role="alert">This is no distance in metres.</span>`}
   </label>`;
 }
 
@@ -420,6 +425,7 @@ function Progress({ phase, onCancel }) {
   }[phase.step];
   return html`<div class="depth-progress">
     <progress
+      key=${phase.step}
       aria-label="Progress"
       value=${phase.step === "upload" && phase.fraction !== null ? phase.fraction : undefined}
     ></progress>
@@ -447,15 +453,9 @@ function placeOfWarning(text) {
 
 /** @param {any} camera */
 function about({ image_width_px, image_height_px, focus_distance_m, range_m, description }) {
-  const range = `reads ${range_m.near.toPrecision(2)} to ${range_m.far.toPrecision(2)} m well`;
+  const range = `reads ${short(range_m.near, 2)} to ${short(range_m.far, 2)} m well`;
   const numbers = `${image_width_px} × ${image_height_px} px, focused at ${focus_distance_m} m, ${range}`;
   return description ? `${description}. ${numbers}` : numbers;
-}
-
-/** @param {File} file */
-function mediaTypeOf(file) {
-  // the service looks at the bytes where no kind is told
-  return file.type.startsWith("image/") ? file.type : "application/octet-stream";
 }
 
 /**

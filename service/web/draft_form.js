@@ -1,6 +1,6 @@
 /** A camera drafted by the service from a photograph's EXIF, to be completed and stored. */
 
-import { Problem, getJson, upload } from "./api.js";
+import { Problem, sendJson, upload } from "./api.js";
 import { ProblemBox } from "./problem_box.js";
 import { html, useEffect, useState } from "./vendor/preact.js";
 
@@ -48,9 +48,7 @@ export function DraftForm({ file, mediaType, onStored }) {
     setIsStoring(true);
     setProblem(null);
     try {
-      const headers = { "Content-Type": "application/json" };
-      const stored = await getJson("cameras", { method: "POST", headers, body: JSON.stringify(camera) });
-      await onStored(stored.name);
+      await onStored((await sendJson("cameras", camera)).name);
     } catch (error) {
       show(error);
     } finally {

@@ -1,6 +1,6 @@
 /** The answer as a file in every format, and the request for it as something to paste. */
 
-import { Problem, problemOf, request, storedKey } from "./api.js";
+import { Problem, getBlob, problemOf, storedKey } from "./api.js";
 import { FORMATS, answerName, curlCommand, depthPath, pythonCommand } from "./commands.js";
 import { ProblemBox } from "./problem_box.js";
 import { save } from "./save.js";
@@ -37,10 +37,7 @@ export function Exports({ ask, file, mediaType, npz, announce }) {
   }
 
   // the service keeps no photograph: it is sent again
-  async function fetched() {
-    const sent = await request(path, { method: "POST", body: file, headers: { "Content-Type": mediaType } });
-    return sent.blob();
-  }
+  const fetched = () => getBlob(path, { method: "POST", body: file, headers: { "Content-Type": mediaType } });
 
   /** @param {typeof curlCommand} write */
   async function copy(write) {

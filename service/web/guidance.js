@@ -58,24 +58,24 @@ export function focusOf(seen, told) {
 /**
  * @param {Seen[]} seen
  * @param {number | null} toldFocus in metres
- * @returns {{next: string, isEnough: boolean}}
+ * @returns {string}
  */
 export function adviceFor(seen, toldFocus) {
   const left = WANTED - seen.length;
   const tilted = seen.filter(({ tilt }) => tilt !== null && tilt >= TILTED_DEG).length;
   const tilt = tilted < WANTED_TILTED ? ", tilted by 15 to 25 degrees" : "";
   if (seen.length === 0) {
-    return { next: "Begin with one in which the sheet is sharp and fills most of the frame.", isEnough: false };
+    return "Begin with one in which the sheet is sharp and fills most of the frame.";
   }
   const side = missingSide(seen, focusOf(seen, toldFocus));
-  if (side) return { next: `Next: one ${side}${tilt}.`, isEnough: false };
+  if (side) return `Next: one ${side}${tilt}.`;
   const corner = missingCorner(coverageOf(seen));
   if (corner && (left > 0 || seen.length < WANTED + 4)) {
-    return { next: `Next: one with the sheet towards the ${corner}${tilt}.`, isEnough: left <= 0 };
+    return `Next: one with the sheet towards the ${corner}${tilt}.`;
   }
-  if (tilt && seen.some((one) => one.tilt !== null)) return { next: `Next: one${tilt}.`, isEnough: left <= 0 };
-  if (left > 0) return { next: `Next: ${left === 1 ? "one more" : `${left} more`}, each at another distance and tilt.`, isEnough: false };
-  return { next: "This is a good set: start the calibration.", isEnough: true };
+  if (tilt && seen.some((one) => one.tilt !== null)) return `Next: one${tilt}.`;
+  if (left > 0) return `Next: ${left === 1 ? "one more" : `${left} more`}, each at another distance and tilt.`;
+  return "This is a good set: start the calibration.";
 }
 
 /**
@@ -100,7 +100,7 @@ function missingSide(seen, focus) {
   return nearer < WANTED_A_SIDE ? at(NEARER) : null;
 }
 
-/** @param {Seen} seen the sheet's width as a part of the frame's */
+/** @param {Seen} seen the circles' diagonal as a part of the frame's width */
 function sizeOf({ circles, width }) {
   const across = circles.map(({ u_px: u }) => u);
   const down = circles.map(({ v_px: v }) => v);

@@ -1,6 +1,6 @@
 /** The third and fourth step: a calibration while it runs, and what it found. */
 
-import { Problem, getJson, problemOf, request } from "./api.js";
+import { Problem, problemOf, request, sendJson } from "./api.js";
 import { Chart } from "./chart.js";
 import { counted, measure, short } from "./numbers.js";
 import { ProblemBox } from "./problem_box.js";
@@ -11,14 +11,13 @@ const MOST_DOTS = 600;
 const ROLES = { focused: "focused on it", defocused: "focus locked" };
 const SPREADS = { disc: "a disc", gaussian: "a Gaussian" };
 
-/** @param {{job: any, onCancelled: () => void}} props */
-export function Running({ job, onCancelled }) {
+/** @param {{job: any}} props */
+export function Running({ job }) {
   const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
 
   async function cancel() {
     try {
       await request(`calibrations/${job.id}`, { method: "DELETE" });
-      onCancelled();
     } catch (error) {
       setProblem(problemOf(error));
     }
@@ -99,7 +98,7 @@ export function Ended({ job, cameras, onAccepted, onDiscard, onAgain, go }) {
           <${Constant} name="gamma" unit="px" of=${result.gamma_px} />
           <${Constant} name="Focus distance" unit="m" of=${result.focus_distance_m} />
         </dl>
-        ${[...result.warnings].length > 0 &&
+        ${result.warnings.length > 0 &&
         html`<ul class="notice plain">${result.warnings.map((/** @type {string} */ words) => html`<li>${words}</li>`)}</ul>`}
         <${Accept} job=${job} cameras=${cameras} onAccepted=${onAccepted} onDiscard=${onDiscard} go=${go} />
       </div>
@@ -250,11 +249,9 @@ function Accept({ job, cameras, onAccepted, onDiscard, go }) {
   async function accept(event) {
     event.preventDefault();
     try {
-      const headers = { "Content-Type": "application/json" };
-      const body = JSON.stringify({ camera: name.trim() });
-      await request(`calibrations/${job.id}/accept`, { method: "POST", headers, body });
+      const stored = await sendJson(`calibrations/${job.id}/accept`, { camera: name.trim() });
       setProblem(null);
-      onAccepted(await getJson(`calibrations/${job.id}`));
+      onAccepted(stored);
     } catch (error) {
       setProblem(problemOf(error));
     }

@@ -28,6 +28,11 @@ export function counted(count, one, many = `${one}s`) {
   return `${count} ${count === 1 ? one : many}`;
 }
 
+/** @param {string} text as it is typed, with a point or a comma */
+export function decimal(text) {
+  return Number(text.replace(",", "."));
+}
+
 /** @param {string} time in ISO 8601 */
 export function when(time) {
   return new Date(time).toLocaleString(undefined, { dateStyle: "medium", timeStyle: "short" });

@@ -1,13 +1,13 @@
 /** The second step: photographs of the sheet, each looked at as it comes, and what the set lacks yet. */
 
-import { Problem, problemOf, request } from "./api.js";
+import { Problem, getJson, problemOf } from "./api.js";
 import { Chart } from "./chart.js";
 import { WANTED, adviceFor, coverageOf, focusOf } from "./guidance.js";
 import { counted, measure } from "./numbers.js";
+import { PHOTOGRAPHS, mediaTypeOf } from "./photograph_files.js";
 import { html, useEffect, useRef, useState } from "./vendor/preact.js";
 
 const THUMB_PX = 320;
-const ACCEPT = "image/*,.dng,.cr2,.nef,.arw,.heic,.heif";
 const EXPOSURES = { good: "good", over: "too bright", under: "too dark" };
 
 /** @typedef {"focused" | "defocused"} Role */
@@ -77,9 +77,8 @@ export function useLooks(photos, setPhotos, query) {
 async function lookAt(file, query, signal) {
   for (;;) {
     try {
-      const headers = { "Content-Type": file.type || "application/octet-stream" };
-      const answer = await request(`calibrate/look?${query}`, { method: "POST", headers, body: file, signal });
-      return await answer.json();
+      const headers = { "Content-Type": mediaTypeOf(file) };
+      return await getJson(`calibrate/look?${query}`, { method: "POST", headers, body: file, signal });
     } catch (error) {
       if (!(error instanceof Problem && error.retryAfterS)) throw error;
       const waitMs = error.retryAfterS * 1000;
@@ -96,7 +95,7 @@ async function lookAt(file, query, signal) {
 export function Photographs({ photos, query, focus, onAdd, onChange, announce }) {
   const waiting = photos.filter(({ asked }) => asked !== query).length;
   const seen = photos.filter(({ look }) => look?.found).map(seenOf);
-  const { next } = adviceFor(seen, focus);
+  const next = adviceFor(seen, focus);
   useEffect(() => {
     if (photos.length > 0 && waiting === 0) announce(`The sheet is found in ${seen.length} of ${counted(photos.length, "photograph")}. ${next}`);
   }, [waiting === 0, photos.length]);
@@ -180,7 +179,7 @@ function DropZone({ role, title, words, onFiles }) {
         type="file"
         multiple
         hidden
-        accept=${ACCEPT}
+        accept=${PHOTOGRAPHS}
         data-role=${role}
         aria-label=${title}
         onChange=${() => {
@@ -236,7 +235,7 @@ function PhotoCard({ photo, isLooking, hasPartner: partner, onRole, onAgain, onR
 /** @param {Photo} photo @param {boolean} isLooking @returns {[string, string]} */
 function statusOf({ look, problem }, isLooking) {
   if (isLooking) return ["", "looking ..."];
-  if (problem) return ["bad", problem.status >= 400 && problem.status < 500 ? "not readable" : "not looked at"];
+  if (problem) return ["bad", [413, 415, 422].includes(problem.status) ? "not readable" : "not looked at"];
   if (!look?.found) return ["bad", "no grid"];
   if (look.measured === 0) return ["bad", "not measured"];
   return look.warnings.length > 0 || look.exposure !== "good" ? ["warn", "found"] : ["good", "found"];
@@ -300,7 +299,7 @@ function draw(canvas, bitmap, look) {
  * @param {number} y
  * @param {{orientation: number, width_px: number, height_px: number}} look
  */
-export function upright(x, y, { orientation, width_px: width, height_px: height }) {
+function upright(x, y, { orientation, width_px: width, height_px: height }) {
   const [left, up] = [width - x, height - y];
   return /** @type {[number, number][]} */ ([[x, y], [left, y], [left, up], [x, up], [y, x], [up, x], [up, left], [y, left]])[orientation - 1];
 }

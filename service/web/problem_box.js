@@ -16,7 +16,7 @@ export function ProblemBox({ problem, onRetry, onClose }) {
       <p><strong>${title}</strong> ${detail}</p>
       ${isMoreThanDetail &&
       html`<ul>${errors.map((fault) => html`<li><code>${fault.pointer}</code> ${fault.detail}</li>`)}</ul>`}
-      ${requestId && html`<p class="hint">Request ${requestId}</p>`}
+      ${requestId && html`<p class="hint" aria-live="off">Request ${requestId}</p>`}
       ${(onRetry || onClose) &&
       html`<div class="row">
         ${onRetry &&

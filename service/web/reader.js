@@ -14,8 +14,11 @@ export class DepthReader {
       if (failure === undefined) resolve(result);
       else reject(new Error(failure));
     };
+    /** @type {Error | null} */
+    this.fault = null;
     this.worker.onerror = () => {
-      for (const { reject } of this.waiting.values()) reject(new Error("The page's worker did not start."));
+      const fault = (this.fault = new Error("The page's worker did not start."));
+      for (const { reject } of this.waiting.values()) reject(fault);
       this.waiting.clear();
     };
   }
@@ -28,7 +31,9 @@ export class DepthReader {
    */
   ask(kind, about) {
     const id = this.asked++;
-    const answer = new Promise((resolve, reject) => this.waiting.set(id, { resolve, reject }));
+    const answer = this.fault
+      ? Promise.reject(this.fault)
+      : new Promise((resolve, reject) => this.waiting.set(id, { resolve, reject }));
     this.worker.postMessage({ id, kind, about });
     return /** @type {ReturnType<Work[Kind]>} */ (answer);
   }

@@ -1,7 +1,8 @@
 /** The first step: the sheet to print, and how large it came out of the printer. */
 
-import { Problem, request } from "./api.js";
-import { short } from "./numbers.js";
+import { Problem, getBlob, problemOf, storedKey } from "./api.js";
+import { decimal, short } from "./numbers.js";
+import { ProblemBox } from "./problem_box.js";
 import { save } from "./save.js";
 import { TextField } from "./text_field.js";
 import { html, useEffect, useState } from "./vendor/preact.js";
@@ -26,9 +27,6 @@ export const SHEET = {
   ruler_mm: "100",
 };
 
-/** @param {string} text */
-const toNumber = (text) => Number(text.replace(",", "."));
-
 /**
  * The pattern as it came out of the printer.
  *
@@ -36,12 +34,12 @@ const toNumber = (text) => Number(text.replace(",", "."));
  * @returns {{kind: string, rows: number, columns: number, spacing_mm: number, diameter_mm: number}}
  */
 export function patternOf({ kind, rows, columns, spacing_mm, diameter_mm, ruler_mm }) {
-  const scale = toNumber(ruler_mm) / RULER_MM;
-  const printed = (/** @type {string} */ length) => Number((toNumber(length) * scale).toPrecision(6));
+  const scale = decimal(ruler_mm) / RULER_MM;
+  const printed = (/** @type {string} */ length) => Number((decimal(length) * scale).toPrecision(6));
   return {
     kind,
-    rows: toNumber(rows),
-    columns: toNumber(columns),
+    rows: decimal(rows),
+    columns: decimal(columns),
     spacing_mm: printed(spacing_mm),
     diameter_mm: printed(diameter_mm),
   };
@@ -49,7 +47,7 @@ export function patternOf({ kind, rows, columns, spacing_mm, diameter_mm, ruler_
 
 /** @param {Sheet} sheet */
 export function isMeasured({ ruler_mm }) {
-  return toNumber(ruler_mm) >= 50 && toNumber(ruler_mm) <= 200;
+  return decimal(ruler_mm) >= 50 && decimal(ruler_mm) <= 200;
 }
 
 /**
@@ -57,6 +55,8 @@ export function isMeasured({ ruler_mm }) {
  */
 export function SheetStep({ sheet, onChange, onNext }) {
   const { picture, problem } = usePicture(sheet);
+  const [failed, setFailed] = useState(/** @type {Problem | null} */ (null));
+  const isNone = problem?.status === 422;
   const printed = patternOf(sheet);
   const hasScale = isMeasured(sheet);
   const fault = (/** @type {string} */ name) => problem?.errors.find(({ pointer }) => pointer === name)?.detail ?? "";
@@ -71,8 +71,12 @@ export function SheetStep({ sheet, onChange, onNext }) {
 
   /** @param {"pdf" | "svg"} kind */
   async function download(kind) {
-    const answer = await request(`calibrate/target.${kind}?${queryOf(sheet)}`);
-    save(await answer.blob(), `camind-sheet.${kind}`);
+    setFailed(null);
+    try {
+      save(await getBlob(`calibrate/target.${kind}?${queryOf(sheet)}`), `camind-sheet.${kind}`);
+    } catch (error) {
+      setFailed(problemOf(error));
+    }
   }
 
   return html`
@@ -85,9 +89,10 @@ export function SheetStep({ sheet, onChange, onNext }) {
           <li>Glue the sheet to something flat.</li>
         </ol>
         <div class="row">
-          <button type="button" class="primary" disabled=${problem !== null} onClick=${() => download("pdf")}>Download PDF</button>
-          <button type="button" disabled=${problem !== null} onClick=${() => download("svg")}>Download SVG</button>
+          <button type="button" class="primary" disabled=${isNone} onClick=${() => download("pdf")}>Download PDF</button>
+          <button type="button" disabled=${isNone} onClick=${() => download("svg")}>Download SVG</button>
         </div>
+        <${ProblemBox} problem=${failed} />
         ${field("ruler_mm", "Measure this: the printed ruler is ... mm long", hasScale ? "" : "Between 50 and 200 mm.")}
         ${hasScale &&
         html`<p class="hint" aria-live="polite">
@@ -122,9 +127,9 @@ export function SheetStep({ sheet, onChange, onNext }) {
             ${field("spacing_mm", "Spacing (mm)")} ${field("diameter_mm", "Diameter (mm)")}
           </div>
         </details>
-        ${problem && !problem.errors.length && html`<p class="fault" role="alert">${problem.detail}</p>`}
+        ${isNone && !problem.errors.length && html`<p class="fault" role="alert">${problem.detail}</p>`}
         <div class="row">
-          <button type="button" class="primary" disabled=${!hasScale || problem !== null} onClick=${onNext}>
+          <button type="button" class="primary" disabled=${!hasScale || isNone} onClick=${onNext}>
             Next: photographs
           </button>
         </div>
@@ -132,7 +137,7 @@ export function SheetStep({ sheet, onChange, onNext }) {
       <figure class="card sheet">
         ${picture
           ? html`<img src=${picture} alt=${`The sheet: ${sheet.rows} rows and ${sheet.columns} columns of circles above a ruler`} />`
-          : html`<p class="hint">${problem ? "There is no such sheet." : "Drawing the sheet ..."}</p>`}
+          : html`<p class="hint">${isNone ? "There is no such sheet." : (problem?.detail ?? "Drawing the sheet ...")}</p>`}
       </figure>
     </div>
   `;
@@ -152,8 +157,8 @@ function usePicture(sheet) {
     const stop = new AbortController();
     const timer = setTimeout(async () => {
       try {
-        const answer = await request(`calibrate/target.svg?${query}`, { signal: stop.signal, asks: false });
-        setState({ picture: URL.createObjectURL(await answer.blob()), problem: null });
+        const drawn = await getBlob(`calibrate/target.svg?${query}`, { signal: stop.signal, asks: false });
+        setState({ picture: URL.createObjectURL(drawn), problem: null });
       } catch (error) {
         if (error instanceof Problem) setState({ picture: null, problem: error });
       }
@@ -162,7 +167,7 @@ function usePicture(sheet) {
       clearTimeout(timer);
       stop.abort();
     };
-  }, [query]);
+  }, [query, storedKey()]);
   useEffect(() => () => void (state.picture && URL.revokeObjectURL(state.picture)), [state.picture]);
   return state;
 }

@@ -1,6 +1,6 @@
 /** The view Status: whether the service can work, how busy it is, and how good its model is. */
 
-import { Problem, getJson, request, storedKey } from "./api.js";
+import { Problem, getBlob, getJson, getText, problemOf, storedKey } from "./api.js";
 import { ProblemBox } from "./problem_box.js";
 import { histogramOf, readSamples, valueOf } from "./prometheus.js";
 import { save } from "./save.js";
@@ -31,10 +31,10 @@ const STAGES = [
   ["encode", "Encode"],
 ];
 const SCORES = [
-  ["abs_rel", "AbsRel", "mean error, as a part of the distance"],
-  ["constant_abs_rel", "Best constant", "AbsRel of the best single distance for each picture"],
-  ["median_error", "Median error", "half of the pixels are off by less"],
-  ["rmse_m", "RMSE, m", "root of the mean squared error"],
+  ["abs_rel", "AbsRel"],
+  ["constant_abs_rel", "Best constant"],
+  ["median_error", "Median error"],
+  ["rmse_m", "RMSE, m"],
 ];
 const RANGES = {
   blur_px: "Blur, px",
@@ -42,6 +42,7 @@ const RANGES = {
   focus_distance_m: "Focus distance, m",
   focal_length_px: "Focal length, px",
   gamma_px: "γ, px",
+  depth_ratio: "Depth, of focus distance",
 };
 
 /** @param {import("./app.js").ViewProps} props */
@@ -114,8 +115,7 @@ async function lookedAt(before, signal) {
 
 /** @param {AbortSignal} signal */
 async function getSamples(signal) {
-  const answer = await request("metrics", { signal, asks: false });
-  return readSamples(await answer.text());
+  return readSamples(await getText("metrics", { signal, asks: false }));
 }
 
 /**
@@ -161,15 +161,21 @@ function Readiness({ ready, samples, at, onRetry }) {
 
 /** @param {{wantsKey: boolean}} props */
 function Documents({ wantsKey }) {
+  const [failed, setFailed] = useState(/** @type {Problem | null} */ (null));
   if (!wantsKey) {
     return html`<p><a href="docs">API, to try out</a> · <a href="openapi.json">API as OpenAPI</a></p>`;
   }
   async function download() {
-    const answer = await request("openapi.json");
-    save(await answer.blob(), "openapi.json");
+    setFailed(null);
+    try {
+      save(await getBlob("openapi.json"), "openapi.json");
+    } catch (error) {
+      setFailed(problemOf(error));
+    }
   }
   return html`
     <div class="row"><button type="button" onClick=${download}>Download the API as OpenAPI</button></div>
+    <${ProblemBox} problem=${failed} />
     <p class="hint">
       The API, to try out, is at <code>docs</code>. It asks for the key as well, which a browser does not send along with a
       link.
@@ -264,7 +270,7 @@ function Stages({ samples }) {
             ({ stage, meaning, meanMs }) => html`<tr key=${stage}>
               <th scope="row">${meaning}</th>
               <td class="number">${meanMs.toFixed(meanMs < 10 ? 1 : 0)}</td>
-              <td class="bars"><div style=${{ width: `${(100 * meanMs) / longestMs}%` }}></div></td>
+              <td class="bars"><div style=${{ width: `${(100 * meanMs) / (longestMs || 1)}%` }}></div></td>
             </tr>`,
           )}
         </tbody>
@@ -292,7 +298,8 @@ function ModelFacts({ manifest, card }) {
   return html`
     <p class="hint">
       Kind ${manifest.kind}, made ${new Date(manifest.created_at).toLocaleDateString()}. Trained within these ranges, in
-      pixels of the image as the model reads it; beyond them the service warns.
+      pixels of the image as the model reads it. Beyond them the service warns, and beyond those of blur and depth it gives
+      no answer.
     </p>
     <dl class="ranges">
       ${Object.entries(RANGES).map(
@@ -320,7 +327,7 @@ function Scores({ scores }) {
         <thead>
           <tr>
             <th scope="col">Set</th>
-            ${SCORES.map(([, title, meaning]) => html`<th scope="col" class="number" title=${meaning}>${title}</th>`)}
+            ${SCORES.map(([, title]) => html`<th scope="col" class="number">${title}</th>`)}
           </tr>
         </thead>
         <tbody>
@@ -335,7 +342,8 @@ function Scores({ scores }) {
     </div>
     <p class="hint">
       AbsRel is the mean error as a part of the distance; half of the pixels are off by less than the median error. The best
-      constant is the AbsRel of the best single distance for each picture: a model that reads depth beats it.
+      constant is the AbsRel of the best single distance for each picture: a model that reads depth beats it. RMSE is the root of
+      the mean squared error.
     </p>
   `;
 }

@@ -11,13 +11,18 @@ PROGRAMS = ("chromium", "chromium-browser", "google-chrome")
 ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
+def program() -> str:
+    """The path of the browser. Raises ``FileNotFoundError`` where none is installed."""
+    found = next(filter(None, map(shutil.which, PROGRAMS)), None)
+    if found is None:
+        raise FileNotFoundError("the page is opened in a browser: install Debian's package chromium (`make chromium`)")
+    return found
+
+
 @contextmanager
 def running_browser() -> Iterator[Browser]:
     """A browser for a while. Raises ``FileNotFoundError`` where none is installed."""
-    program = next(filter(None, map(shutil.which, PROGRAMS)), None)
-    if program is None:
-        raise FileNotFoundError("the page is opened in a browser: install Debian's package chromium (`make chromium`)")
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=program, args=ARGUMENTS)
+        browser = playwright.chromium.launch(executable_path=program(), args=ARGUMENTS)
         yield browser
         browser.close()

@@ -13,6 +13,7 @@ from playwright.sync_api import Browser, FilePayload, Page, expect
 from model_export.served import Server, serving
 from tests.simulated_sheets import CAMERA, DEPTHS_M, GRID, shots
 from tests.web.chromium import running_browser
+from tests.web.steps import to_photographs
 from tests.web.watched import watched
 
 ROOT = Path(__file__).parents[2]
@@ -22,7 +23,6 @@ MOST_BYTES = 200_000
 JPEG_QUALITY = 85
 CALIBRATION_MS = 300_000
 SHEET_DEPTHS_M = DEPTHS_M[::2]
-SHEET = {"Rows": GRID.rows, "Columns": GRID.columns, "Spacing (mm)": GRID.spacing_mm, "Diameter (mm)": GRID.diameter_mm}
 D200 = {
     "name": "d200",
     "description": "Nikon D200, 35 mm at f/2.8, focused at 2 m",
@@ -97,12 +97,7 @@ def cameras(page: Page) -> None:
 
 def photographs(page: Page) -> None:
     """Photographs of a simulated sheet, each with what was found in it."""
-    page.get_by_text("Another grid or paper").click()
-    for label, value in SHEET.items():
-        page.get_by_label(label, exact=True).fill(f"{value:g}")
-    page.get_by_label("Measure this").fill("100")
-    page.get_by_role("button", name="Next: photographs").click()
-    page.get_by_label("Camera", exact=True).fill("bench")
+    to_photographs(page, "bench")
     page.locator("input[data-role=defocused]").set_input_files(simulated_photographs())
     shown = page.get_by_role("list", name="Photographs")
     expect(shown.get_by_text("found", exact=True)).to_have_count(len(SHEET_DEPTHS_M), timeout=CALIBRATION_MS)

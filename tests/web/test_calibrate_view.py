@@ -13,11 +13,10 @@ from playwright.sync_api import Browser, Page, expect
 
 from model_export.served import Server, serving
 from tests.simulated_sheets import CAMERA, DEPTHS_M, GRID, shots
+from tests.web.steps import OVERFLOW, to_photographs
 from tests.web.watched import watched
 
 LONG_MS = 120_000
-OVERFLOW = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
-SHEET = {"Rows": GRID.rows, "Columns": GRID.columns, "Spacing (mm)": GRID.spacing_mm, "Diameter (mm)": GRID.diameter_mm}
 K_CAM = {
     "image_width_px": CAMERA.width_px,
     "image_height_px": CAMERA.height_px,
@@ -51,16 +50,6 @@ def no_calibration(served: Server) -> Iterator[None]:
     yield
     for item in served.ask("GET", "/calibrations").json()["items"]:
         served.ask("DELETE", f"/calibrations/{item['id']}")
-
-
-def to_photographs(page: Page, name: str, ruler_mm: str = "100") -> None:
-    page.goto("#calibrate")
-    page.get_by_text("Another grid or paper").click()
-    for label, value in SHEET.items():
-        page.get_by_label(label, exact=True).fill(f"{value:g}")
-    page.get_by_label("Measure this").fill(ruler_mm)
-    page.get_by_role("button", name="Next: photographs").click()
-    page.get_by_label("Camera", exact=True).fill(name)
 
 
 def drop(page: Page, *files: Path, role: str = "defocused") -> None:
@@ -178,6 +167,11 @@ def test_a_running_one_is_cancelled(page: Page, served: Server, photographs: lis
     newest = served.ask("GET", "/calibrations").json()["items"][0]
     assert (newest["camera"], newest["state"]) == (name, "cancelled")
     expect(page.get_by_role("row", name=re.compile(f"{name}.*cancelled"))).to_be_visible()
+    # the same photographs once more are another calibration
+    page.get_by_role("button", name="Back to the photographs").click()
+    page.get_by_role("button", name="Start the calibration").click()
+    expect(page.get_by_role("heading", name=f"What was found for {name}")).to_be_visible(timeout=LONG_MS)
+    assert len(served.ask("GET", "/calibrations").json()["items"]) == 2
 
 
 def test_a_service_that_goes_away_is_told(

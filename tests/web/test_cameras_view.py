@@ -11,11 +11,11 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from model_export.served import Server
+from tests.web.steps import OVERFLOW
 
 JSON = {"Content-Type": "application/json"}
 LENS = {"Focal length (mm)": "35", "f-number": "2.8", "Pixel pitch (µm)": "6.05", "Sensor width (px)": "3872"}
 FRAME = {"Image width (px)": "645", "Image height (px)": "432", "Focus distance (m)": "2"}
-OVERFLOW = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
 
 
 @pytest.fixture(autouse=True)

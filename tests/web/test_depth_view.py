@@ -3,7 +3,6 @@
 import base64
 import io
 import json
-import shutil
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -20,7 +19,8 @@ from playwright.sync_api import Browser, Locator, Page, Position, expect
 
 from model_export.served import Server, serving
 from tests.inference import photographs
-from tests.web.chromium import PROGRAMS
+from tests.web.chromium import program
+from tests.web.steps import OVERFLOW
 from tests.web.watched import watched
 
 PHOTOGRAPH = Path(__file__).parents[2] / "docs" / "pictures" / "coffee.jpg"
@@ -317,15 +317,14 @@ def test_nothing_keeps_people_out(measured: Page, barriers: Callable[[Page], lis
         measured.emulate_media(color_scheme=scheme)
         assert barriers(measured) == [], scheme
     measured.set_viewport_size({"width": 360, "height": 640})
-    assert measured.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
+    assert measured.evaluate(OVERFLOW) <= 0
     measured.get_by_role("tab", name="3D").click()
     assert barriers(measured) == []
 
 
 def test_without_webgl_the_page_says_so(served: Server, d200: dict[str, Any], browser: Browser) -> None:
     served.add(d200)
-    program = next(filter(None, map(shutil.which, PROGRAMS)))
-    blind = browser.browser_type.launch(executable_path=program, args=NO_GRAPHICS)
+    blind = browser.browser_type.launch(executable_path=program(), args=NO_GRAPHICS)
     with closing(blind), watched(blind, served.url, []) as page:
         page.goto("")
         choose(page)

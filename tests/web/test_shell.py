@@ -16,13 +16,13 @@ from service.principal import EVERYDAY, SCOPES, Scope
 from service.storage import schema
 from service.storage.engine import open_engine
 from service.storage.keys import Keys
+from tests.web.steps import OVERFLOW
 from tests.web.watched import watched
 
 ROOT = Path(__file__).parents[2]
 TABS = ("depth", "cameras", "calibrate", "status")
 QUOTA = 40
 REFUSED = "status of 401"
-OVERFLOW = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
 
 
 @dataclass(frozen=True)

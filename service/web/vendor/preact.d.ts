@@ -1,4 +1,4 @@
-// Types of preact.js, from the packages it was made of.
+// Types of preact.js: those of preact, which has some more.
 import type { VNode } from "preact";
 
 export { Component, createContext, h, render } from "preact";

@@ -1,0 +1,19 @@
+"""What tests of the page and its pictures do alike."""
+
+from playwright.sync_api import Page
+
+from tests.simulated_sheets import GRID
+
+OVERFLOW = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+SHEET = {"Rows": GRID.rows, "Columns": GRID.columns, "Spacing (mm)": GRID.spacing_mm, "Diameter (mm)": GRID.diameter_mm}
+
+
+def to_photographs(page: Page, name: str, ruler_mm: str = "100") -> None:
+    """Say which sheet was printed, and go on to its photographs by a camera of this name."""
+    page.goto("#calibrate")
+    page.get_by_text("Another grid or paper").click()
+    for label, value in SHEET.items():
+        page.get_by_label(label, exact=True).fill(f"{value:g}")
+    page.get_by_label("Measure this").fill(ruler_mm)
+    page.get_by_role("button", name="Next: photographs").click()
+    page.get_by_label("Camera", exact=True).fill(name)
