@@ -22,6 +22,7 @@ from service.inference.cancellation import Cancellation
 from service.inference.depth_map import SIGMA_OF_LAPLACE, DepthMap
 from service.inference.estimator import Estimator
 from service.inference.pair import GraphPair, RawMaps, Stopwatch
+from service.optics import thin_lens
 from service.optics.camera import Camera
 
 # an unknown camera is taken for the middle one of those that are scored
@@ -36,6 +37,11 @@ BLUR_RANGES_PX = (
     *((0.0, 0.5), (0.5, 1.0), (1.0, 2.0), (2.0, 4.0), (4.0, 8.0), (8.0, 16.0), (16.0, math.inf)),
     *((0.6, 1.0), (1.0, 8.0), (0.0, math.inf)),
 )
+# where sets by other cameras, or focused elsewhere, can be compared: by lambda, and by |x|
+EQUAL_BLUR_PX = ((1.0, 2.0), (2.0, 4.0), (4.0, 8.0), (8.0, 16.0))
+EQUAL_DEFOCUS = ((0.1, 0.25), (0.25, 0.5), (0.5, 1.0), (1.0, 2.0))
+EQUAL = ("equal_blur", "equal_defocus")
+LEAST_COMPARED = 300
 KEPT_SHARES = (1.0, 0.75, 0.5, 0.25, 0.1)
 CLEARLY_OUT = 0.25  # |x| from where on the side of focus is asked for
 SAMPLED_PIXELS = 3000
@@ -116,7 +122,8 @@ class Sides:
 class Outcome:
     """What one picture scored, what the best constant depth would have, and the share of scored pixels answered.
 
-    ``sides`` is None where the side was told.
+    ``depth_blur_px`` and ``depth_defocus`` are lambda and |x| of the pixels of ``depth``. ``sides`` is None where the
+    side was told.
     """
 
     scores: Scores
@@ -125,6 +132,8 @@ class Outcome:
     answered: float
     median_error: float
     depth: Pixels
+    depth_blur_px: Map
+    depth_defocus: Map
     blur: Pixels | None
     sides: Sides | None
 
@@ -135,7 +144,8 @@ class Summary:
 
     ``certain_abs_rel`` is that of the half of the pixels with the least stated error; ``order`` is the mean error
     of the most certain tenth over that of the least certain half; ``kept_abs_rel`` has the errors of the most certain
-    shares ``KEPT_SHARES``, and ``within`` the shares of truths within one and two stated deviations.
+    shares ``KEPT_SHARES``, and ``within`` the shares of truths within one and two stated deviations. ``equal_blur`` and
+    ``equal_defocus`` are the AbsRel by range, None where few pixels are.
     """
 
     name: str
@@ -150,6 +160,8 @@ class Summary:
     order: float
     kept_abs_rel: tuple[float, ...]
     within: tuple[float, float]
+    equal_blur: dict[str, float | None]
+    equal_defocus: dict[str, float | None]
     sides: Sides | None
     depth: Pixels
 
@@ -158,11 +170,12 @@ class Summary:
         return self.kept_abs_rel[KEPT_SHARES.index(0.5)]
 
     def as_dict(self) -> dict[str, object]:
-        plain = ("name", "mode", "pictures", "answered", "median_error", "certain_abs_rel", "order")
+        plain = ("name", "mode", "pictures", "answered", "median_error", "certain_abs_rel", "order", *EQUAL)
         tables = ("pooled", "mean", "constant_pooled", "constant_mean")
         shares = {"kept_abs_rel": dict(zip(KEPT_SHARES, self.kept_abs_rel, strict=True)), "within": self.within}
         sides = {"sides": asdict(self.sides) if self.sides else None}
-        return {n: getattr(self, n) for n in plain} | {n: getattr(self, n).as_dict() for n in tables} | shares | sides
+        scores = {n: getattr(self, n).as_dict() for n in tables}
+        return {n: getattr(self, n) for n in plain} | scores | shares | sides
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,6 +272,7 @@ class Examiner:
         truth, depth = case.truth_m[scored], completed(told.depth_m)[scored]
         stated = np.nan_to_num(told.sigma_m / told.depth_m, nan=np.inf)[scored]
         some = slice(None, None, max(1, truth.size // SAMPLED_PIXELS))
+        defocus = thin_lens.relative_defocus(truth[some], case.camera.focus_distance_m)
         outcome = Outcome(
             scores=score(depth, truth),
             constant=score(np.full_like(truth, best_constant(truth)), truth),
@@ -266,6 +280,8 @@ class Examiner:
             answered=float(np.isfinite(told.depth_m[scored]).mean()),
             median_error=float(abs(np.median(depth / truth) - 1)),
             depth=Pixels(truth[some], depth[some], stated[some]),
+            depth_blur_px=thin_lens.blur_from_defocus(defocus * case.camera.k_cam_px, case.camera.gamma_px),
+            depth_defocus=defocus,
             blur=self._blur(case, camera) if mode == "gt" else None,
             sides=_sides(case, told) if case.side == "auto" else None,
         )
@@ -300,6 +316,7 @@ def summarise(name: str, mode: str, outcomes: Sequence[Outcome]) -> Summary:
     if not outcomes:
         raise ValueError(f"{name}: no picture to score")
     depth = Pixels.joined([o.depth for o in outcomes])
+    error = np.abs(depth.error)
     weights = [o.scored_pixels for o in outcomes]
     return Summary(
         name=name,
@@ -314,9 +331,20 @@ def summarise(name: str, mode: str, outcomes: Sequence[Outcome]) -> Summary:
         order=depth.order,
         kept_abs_rel=tuple(depth.kept_error(share) for share in KEPT_SHARES),
         within=(depth.within(1), depth.within(2)),
+        equal_blur=_by_range(error, np.concatenate([o.depth_blur_px for o in outcomes]), EQUAL_BLUR_PX),
+        equal_defocus=_by_range(error, np.concatenate([o.depth_defocus for o in outcomes]), EQUAL_DEFOCUS),
         sides=Sides.joined([o.sides for o in outcomes if o.sides is not None]),
         depth=depth,
     )
+
+
+def _by_range(error: Map, value: Map, ranges: Sequence[tuple[float, float]]) -> dict[str, float | None]:
+    """The mean error where the value lies in each range, None where few pixels do."""
+    found: dict[str, float | None] = {}
+    for low, high in ranges:
+        part = error[(value >= low) & (value < high)]
+        found[f"{low:g}-{high:g}"] = float(part.mean()) if part.size >= LEAST_COMPARED else None
+    return found
 
 
 def blur_ranges(name: str, pixels: Pixels) -> list[BlurRange]:

@@ -14,7 +14,16 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from model_export.cases import UNSEEN_K_CAM_PX, VIEWS
-from model_export.evaluate import KEPT_SHARES, MODES, BlurRange, Pixels, Report, Summary
+from model_export.evaluate import (
+    EQUAL_BLUR_PX,
+    EQUAL_DEFOCUS,
+    KEPT_SHARES,
+    MODES,
+    BlurRange,
+    Pixels,
+    Report,
+    Summary,
+)
 from service.inference.preview import render_preview
 
 Table = tuple[list[str], list[list[str]]]
@@ -27,6 +36,11 @@ DEPTH_HEAD = [
 CERTAINTY_HEAD = [
     *("set", "camera", "within sigma", "within 2 sigma", *(f"surest {share:.0%}" for share in KEPT_SHARES)),
     *("right side", "either"),
+]
+EQUAL_HEAD = [
+    *("set", "camera"),
+    *(f"lambda {low:g}-{high:g} px" for low, high in EQUAL_BLUR_PX),
+    *(f"x {low:g}-{high:g}" for low, high in EQUAL_DEFOCUS),
 ]
 SCORES_HEAD = ["set", "camera", "over", "AbsRel", "MSE", "RMSE", "log10", "delta1", "delta2", "delta3"]
 BLUR_HEAD = ["scenes", "lambda px", "pixels", "median error", "certain half", "90th percentile", "bias", "order"]
@@ -52,6 +66,11 @@ def _certainty_row(s: Summary) -> list[str]:
     return [*_camera(s), *(f"{v:.1%}" for v in s.within), *(f"{v:.3f}" for v in s.kept_abs_rel), *sides]
 
 
+def _equal_row(s: Summary) -> list[str]:
+    found = (*s.equal_blur.values(), *s.equal_defocus.values())
+    return [*_camera(s), *("" if v is None else f"{v:.3f}" for v in found)]
+
+
 def _score_rows(s: Summary) -> list[list[str]]:
     ways = {"pixels": s.pooled, "pictures": s.mean}
     return [[*_camera(s), way, *(f"{v:.3f}" for v in scores.as_dict().values())] for way, scores in ways.items()]
@@ -68,6 +87,7 @@ def tables(report: Report) -> dict[str, Table]:
     return {
         "Depth": (DEPTH_HEAD, [_depth_row(s) for s in report.sets]),
         "Certainty": (CERTAINTY_HEAD, [_certainty_row(s) for s in report.sets if s.mode == "gt"]),
+        "AbsRel at equal blur and defocus": (EQUAL_HEAD, [_equal_row(s) for s in report.sets if s.mode == "gt"]),
         "All scores of depth": (SCORES_HEAD, [row for s in report.sets for row in _score_rows(s)]),
         "Blur": (BLUR_HEAD, [_blur_row(b) for b in report.blur]),
     }

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from model_export.cases import REFERENCE, Case, d200_cases, procedural_cases, shuffled_cases, viewed_cases
 from model_export.cli import commands
-from model_export.evaluate import Examiner, Pixels, Sides, blur_ranges, summarise
+from model_export.evaluate import EQUAL_BLUR_PX, Examiner, Pixels, Sides, blur_ranges, summarise
 from model_export.temperature import temperature
 from service.optics import thin_lens
 from service.optics.camera import Camera
@@ -51,6 +51,19 @@ def test_a_summary_is_pooled_over_pixels_and_averaged_over_pictures(oracle: Exam
     assert summary.pooled.abs_rel == pytest.approx(0.5 / 3, abs=1e-3)
     with pytest.raises(ValueError, match="no picture"):
         summarise("none", "gt", [])
+
+
+def test_errors_are_told_by_how_far_out_of_focus_the_truth_is(oracle: Examiner) -> None:
+    """Both truths are nearer than focus: one at x 0.58, the other at half of its depth."""
+    summary = summarise("two", "gt", [oracle.answer(case(factor))[0] for factor in (1.0, 0.5)])
+    near, nearer = (CAMERA.focus_distance_m / one.truth_m[0, -1] - 1 for one in (case(1.0), case(0.5)))
+    assert 0.5 < near < 1.0 < nearer < 2.2
+    blurs = [thin_lens.blur_from_defocus(x * CAMERA.k_cam_px, CAMERA.gamma_px) for x in (near, nearer)]
+    for value, error in zip(blurs, (0.0, 1.0), strict=True):
+        (span,) = (f"{low:g}-{high:g}" for low, high in EQUAL_BLUR_PX if low <= value < high)
+        assert summary.equal_blur[span] == pytest.approx(error, abs=1e-3)
+    assert summary.equal_defocus["0.5-1"] == pytest.approx(0, abs=1e-3)
+    assert summary.equal_defocus["0.1-0.25"] is None
 
 
 def test_a_wrong_k_cam_is_told_to_the_estimator(oracle: Examiner) -> None:
