@@ -14,8 +14,8 @@ from service.inference.tiles import OVERLAP_PX, PIXEL_BUDGET, read_in_tiles
 from service.opencv import cv2
 from service.optics.camera import Camera
 
-# by a k_cam of 10.7 px, RMSE at full size and on the copy where it is 8: indoor frames 0.174 and 0.181 m, table tops 0.163
-# and 0.115 m
+# by a k_cam of 10.7 px, RMSE at full size and on the copy where it is 8: indoor frames 0.174 and 0.181 m, table tops
+# 0.163 and 0.115 m
 WELL_READ_K_CAM_PX = 8.0
 HIGH_BLUR = 0.8
 HIGH_BLUR_FRACTION = 0.02
