@@ -215,8 +215,8 @@ def test_another_frame_is_refused_with_both_sizes(bench: TestClient) -> None:
 
 
 def test_another_focus_distance_moves_k_cam_and_warns_without_a_focal_length(bench: TestClient) -> None:
-    response = ask(bench, format="npy", focus_distance_m=1.0)
-    np.testing.assert_allclose(npy(response), depth_near(LEVEL, 12.0, 0.5, 1.0), rtol=1e-3)
+    response = ask(bench, format="npy", focus_distance_m=1.6)
+    np.testing.assert_allclose(npy(response), depth_near(LEVEL, 7.5, 0.5, 1.6), rtol=1e-3)
     assert "focal length" in response.headers["Camind-Warnings"]
 
 
