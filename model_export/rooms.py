@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_export.datasets.photos import filled
+from model_export.textures import plain_texture
 from service.optics.light import decode_srgb
 
 OVERSAMPLE = 2
 WALL_SHARE = 0.5
 ROLL = 0.15
-PLAIN_SHARE, PLAIN_GROUND_SHARE = 0.25, 0.1
+PLAIN_SHARE, PLAIN_GROUND_SHARE = 0.25, 0.2
 LEANING_SHARE = 0.15
 LEAST_WALL_VIEW = 0.3
 LEAST_Q = 0.02
@@ -191,10 +192,8 @@ def _paint(texture: Map, hits: Hits, rays: Map, view: View, nearest_z: float) ->
 
 
 def _plain_or(rng: np.random.Generator, plain_share: float, texture: Map) -> Map:
-    """The texture, or its mean colour."""
-    if rng.random() >= plain_share:
-        return texture
-    return np.broadcast_to(texture.mean((0, 1)), texture.shape).copy()
+    """The texture, or its mean colour in soft light."""
+    return texture if rng.random() >= plain_share else plain_texture(rng, texture.mean((0, 1)), texture.shape[0])
 
 
 def _reduced(samples: NDArray[np.floating], size: tuple[int, int]) -> Map:

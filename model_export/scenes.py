@@ -23,7 +23,7 @@ from service.optics.light import decode_srgb, encode_srgb
 # background of a close-up is beyond its focus, and what a distant focus shows is mostly nearer
 SIDE_SHARES_CLOSE, SIDE_SHARES_DISTANT = (0.15, 0.4, 0.45), (0.45, 0.1, 0.45)
 ROOM_SHARE = 0.5
-WALL_SHARE = 0.25  # nothing but a wall: what people photograph first, and what rooms seldom hold
+WALL_SHARE = 0.2  # nothing but a wall: what people photograph first, and what rooms seldom hold
 LEVEL_SHARE = 0.5
 LAYERED_SHARE = 0.7
 NEAREST_AT_MOST, FARTHEST_AT_LEAST = 0.5, 2.0
@@ -37,6 +37,8 @@ CHROMATIC_PART = 0.15
 ACHROMAT_SHARE = 0.75
 MOSAIC_SHARE = 0.4
 MOSAIC_VARIANCE = 0.35  # what a bilinear demosaic adds to luminance, px^2
+SHOT_NOISE, READ_NOISE = (1e-6, 2e-3), (1e-4, 4e-3)
+GRAINY_SHARE, GRAIN = 0.25, (3e-4, 3e-3)  # dim light: grain must not pass for sharpness
 PLAIN_SHARE = 0.35  # not compressed: the network must not need the noise of JPEG
 RESCALED_SHARE = 0.15
 RESCALES = (1.2, 1.6)
@@ -233,7 +235,8 @@ def _through_mosaic(linear: Map) -> Map:
 def develop(rng: np.random.Generator, linear: Map, config: SceneConfig, *, through_mosaic: bool) -> NDArray[np.uint8]:
     """Light on the sensor [h,w,3] to a JPEG's pixels: exposure, noise, demosaic, white balance, tone, sharpening."""
     picture = linear * rng.uniform(0.5, 1.4) / max(float(np.quantile(linear, 0.98)), 0.2)
-    shot_noise, read_noise = _log_uniform(rng, (1e-6, 2e-3)), _log_uniform(rng, (1e-4, 4e-3))
+    shot_noise = _log_uniform(rng, GRAIN if rng.random() < GRAINY_SHARE else SHOT_NOISE)
+    read_noise = _log_uniform(rng, READ_NOISE)
     noise = rng.standard_normal(picture.shape).astype(np.float32)
     spread = rng.uniform(0, 0.9)
     if spread > 0.3 and not through_mosaic:  # filters make noise of neighbours alike

@@ -1,4 +1,4 @@
-"""Sharp textures for scenes: photographs, dead leaves, plain objects, noise of random slope, text and lines.
+"""Sharp textures for scenes: photographs, dead leaves, plain objects, noise of random slope, text, lines and patterns.
 
 Every texture is drawn at twice the size it is wanted and reduced by area, so it is as sharp as pixels allow:
 what blur a scene shows is then the renderer's alone.
@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 OVERSAMPLE = 2
-KINDS = ("photo", "leaves", "objects", "noise", "drawing")
-KIND_SHARES = (0.42, 0.18, 0.23, 0.05, 0.12)
+KIND_SHARES = {"photo": 0.37, "leaves": 0.16, "objects": 0.21, "noise": 0.05, "drawing": 0.1, "pattern": 0.11}
+PATTERNS = ("stripes", "checks", "dots", "bricks", "waves")
+PERIOD_PX = (3.0, 60.0)
 FADED_SHARE = 0.45
 SHADED_SHARE = 0.5
 SOFT_SIGMA_PX = 4.0
@@ -33,22 +34,22 @@ def load_photographs(folder: Path) -> list[NDArray[np.uint8]]:
 
 def draw_texture(rng: np.random.Generator, photographs: list[NDArray[np.uint8]], size: int) -> Image:
     """A sharp sRGB texture [size, size, 3] in 0..1 of a random kind."""
-    kind = rng.choice(KINDS, p=KIND_SHARES)
+    kind = rng.choice(list(KIND_SHARES), p=list(KIND_SHARES.values()))
     if kind == "photo" and photographs:
         texture = _photo(rng, photographs[rng.integers(len(photographs))], size)
-    elif kind == "leaves":
-        texture = _leaves(rng, size)
-    elif kind == "objects":
-        texture = _objects(rng, size)
-    elif kind == "drawing":
-        texture = _drawing(rng, size)
     else:
-        texture = _noise(rng, size)
+        texture = _DRAWN.get(kind, _noise)(rng, size)
     if rng.random() < FADED_SHARE:
         texture = _faded(rng, texture)
     if rng.random() < SHADED_SHARE:
         texture = _shaded(rng, texture)
     return _recolor(rng, texture)
+
+
+def plain_texture(rng: np.random.Generator, color: Image, size: int) -> Image:
+    """One colour [3] over [size, size, 3], as sharp as the light upon it: soft, sometimes with soft shadows."""
+    texture = np.asarray(np.clip(color * _slope(rng, size), 0, 1), np.float32)
+    return _shaded(rng, texture) if rng.random() < SHADED_SHARE else texture
 
 
 def _shrink(image: NDArray[np.uint8], size: int) -> Image:
@@ -179,6 +180,40 @@ def _drawing(rng: np.random.Generator, size: int) -> Image:
             end = rng.integers(-40, span + 40, 2).tolist()
             cv2.line(canvas, (x, y), (end[0], end[1]), _shade(rng), int(rng.integers(1, 9)))
     return _shrink(canvas, size)
+
+
+def _pattern(rng: np.random.Generator, size: int) -> Image:
+    """What is woven, tiled, ruled or ribbed: one motif over and over in two colours, its rows sometimes bent."""
+    span = size * OVERSAMPLE
+    period = OVERSAMPLE * np.exp(rng.uniform(*np.log(PERIOD_PX)))
+    turn, stretch = rng.uniform(0, 2 * np.pi), np.float32(rng.uniform(0.3, 1.0))
+    at = np.arange(span, dtype=np.float32) / np.float32(period)
+    across = np.float32(np.cos(turn)) * at[None, :] + np.float32(np.sin(turn)) * at[:, None]
+    along = (np.float32(np.cos(turn)) * at[:, None] - np.float32(np.sin(turn)) * at[None, :]) * stretch
+    if rng.random() < 0.4:
+        across += np.float32(rng.uniform(0, 2)) * _smooth_field(rng, span)
+    kind, part = rng.choice(PATTERNS), np.float32(rng.uniform(0.1, 0.6))
+    if kind == "bricks":
+        along = along + np.floor(across) % 2 / 2
+    u, v = across % 1, along % 1
+    if kind == "stripes":
+        cover = (u < part).astype(np.float32)
+    elif kind == "checks":
+        cover = ((u < 0.5) == (v < 0.5)).astype(np.float32)
+    elif kind == "dots":
+        cover = (np.hypot(u - 0.5, v - 0.5) < part / 1.2).astype(np.float32)
+    elif kind == "bricks":
+        shades = rng.uniform(0.7, 1, (16, 16)).astype(np.float32)
+        cover = shades[np.floor(across).astype(int) % 16, np.floor(along).astype(int) % 16]
+        cover = cover * ((u > part / 4) & (v > part / 4 * stretch))
+    else:
+        cover = np.asarray(0.5 + 0.5 * np.sin(2 * np.pi * across), np.float32) ** np.float32(rng.uniform(0.5, 4))
+    ground, motif = _paint(rng), _paint(rng)
+    seen = np.asarray(cv2.resize(cover, (size, size), interpolation=cv2.INTER_AREA), np.float32)
+    return np.asarray(np.clip(ground + seen[..., None] * (motif - ground), 0, 1), np.float32)
+
+
+_DRAWN = {"leaves": _leaves, "objects": _objects, "drawing": _drawing, "pattern": _pattern, "noise": _noise}
 
 
 def _smooth_field(rng: np.random.Generator, size: int) -> NDArray[np.float32]:
