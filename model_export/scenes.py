@@ -6,6 +6,7 @@ sigma = k_cam |q - 1|; q > 1 is nearer than focus, q < 1 beyond.
 
 import math
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 
 import cv2
 import numpy as np
@@ -19,9 +20,11 @@ from model_export.textures import draw_texture
 from service.optics import thin_lens
 from service.optics.light import decode_srgb, encode_srgb
 
-# all nearer than focus, all beyond, both; between the nearest focus and the farthest as its logarithm goes: the
-# background of a close-up is beyond its focus, and what a distant focus shows is mostly nearer
-SIDE_SHARES_CLOSE, SIDE_SHARES_DISTANT = (0.15, 0.4, 0.45), (0.45, 0.1, 0.45)
+BOTH_SIDES_SHARE = 0.4
+# what people photograph is a few metres away: the background of a close-up is beyond its focus, and what a distant
+# focus shows is mostly nearer
+USUAL_DEPTH_M, DEPTH_SPREAD = 2.0, 0.8  # median, and standard deviation of the logarithm
+LIKELIEST_SIDE = 0.85
 ROOM_SHARE = 0.5
 WALL_SHARE = 0.2  # nothing but a wall: what people photograph first, and what rooms seldom hold
 LEVEL_SHARE = 0.5
@@ -79,9 +82,9 @@ def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float], lean: fl
 def draw_shot(rng: np.random.Generator, config: SceneConfig) -> Shot:
     """A random camera, focus distance, lens and side of focus within the config's ranges."""
     focus_distance_m = _log_uniform(rng, config.focus_distance_m)
-    nearest, farthest = config.focus_distance_m
-    distant = math.log(focus_distance_m / nearest) / math.log(farthest / nearest) if farthest > nearest else 0.5
-    side = rng.choice(3, p=(1 - distant) * np.array(SIDE_SHARES_CLOSE) + distant * np.array(SIDE_SHARES_DISTANT))
+    nearer = NormalDist(math.log(USUAL_DEPTH_M), DEPTH_SPREAD).cdf(math.log(focus_distance_m))
+    nearer = min(max(nearer, 1 - LIKELIEST_SIDE), LIKELIEST_SIDE)
+    side = 0 if rng.random() < BOTH_SIDES_SHARE else -1 if rng.random() < nearer else 1
     k_cam_px = _log_uniform(rng, config.k_cam_px, K_CAM_LEAN)
     return Shot(
         k_cam_px=k_cam_px,
@@ -89,7 +92,7 @@ def draw_shot(rng: np.random.Generator, config: SceneConfig) -> Shot:
         focus_distance_m=focus_distance_m,
         focal_length_px=_log_uniform(rng, config.focal_length_px),
         spread=_draw_spread(rng, k_cam_px),
-        side=(-1, 1, 0)[side],
+        side=side,
         depth_ratio=(
             _log_uniform(rng, (config.depth_ratio[0], NEAREST_AT_MOST)),
             _log_uniform(rng, (FARTHEST_AT_LEAST, config.depth_ratio[1])),

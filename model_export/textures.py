@@ -14,6 +14,7 @@ OVERSAMPLE = 2
 KIND_SHARES = {"photo": 0.37, "leaves": 0.16, "objects": 0.21, "noise": 0.05, "drawing": 0.1, "pattern": 0.11}
 PATTERNS = ("stripes", "checks", "dots", "bricks", "waves")
 PERIOD_PX = (3.0, 60.0)
+BENT_SHARE = 0.4
 FADED_SHARE = 0.45
 SHADED_SHARE = 0.5
 SOFT_SIGMA_PX = 4.0
@@ -190,11 +191,11 @@ def _pattern(rng: np.random.Generator, size: int) -> Image:
     at = np.arange(span, dtype=np.float32) / np.float32(period)
     across = np.float32(np.cos(turn)) * at[None, :] + np.float32(np.sin(turn)) * at[:, None]
     along = (np.float32(np.cos(turn)) * at[:, None] - np.float32(np.sin(turn)) * at[None, :]) * stretch
-    if rng.random() < 0.4:
+    if rng.random() < BENT_SHARE:
         across += np.float32(rng.uniform(0, 2)) * _smooth_field(rng, span)
     kind, part = rng.choice(PATTERNS), np.float32(rng.uniform(0.1, 0.6))
     if kind == "bricks":
-        along = along + np.floor(across) % 2 / 2
+        along += np.floor(across) % 2 / 2
     u, v = across % 1, along % 1
     if kind == "stripes":
         cover = (u < part).astype(np.float32)

@@ -55,3 +55,16 @@ def test_most_lenses_blur_red_and_blue_more_before_the_focus_than_beyond() -> No
     shifts = [shift for _ in range(400) for shift in draw_shot(rng, CONFIG).spread.chromatic_px if shift]
     nearer_blurrier = np.array(shifts) < 0  # moves signed defocus, which is negative before the focus
     assert 0.75 < nearer_blurrier.mean() < 0.98
+
+
+@pytest.mark.parametrize(
+    ("focus_m", "nearer", "beyond"), [(0.3, (0.02, 0.2), (0.4, 0.65)), (5.0, (0.4, 0.65), (0.02, 0.2))]
+)
+def test_beyond_a_close_focus_lies_what_is_seen_and_before_a_distant_one(
+    focus_m: float, nearer: tuple[float, float], beyond: tuple[float, float]
+) -> None:
+    rng = np.random.default_rng(0)
+    config = SceneConfig(focus_distance_m=(focus_m, focus_m))
+    sides = np.array([draw_shot(rng, config).side for _ in range(400)])
+    for side, (low, high) in ((-1, nearer), (1, beyond), (0, (0.3, 0.5))):
+        assert low < (sides == side).mean() < high

@@ -1,0 +1,48 @@
+"""Textures: every kind is as sharp as pixels allow, and what is plain is as soft as the light upon it."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from model_export import textures
+from model_export.textures import KIND_SHARES, PATTERNS, draw_texture, plain_texture
+
+SIZE = 128
+PHOTOGRAPH = np.random.default_rng(0).integers(0, 256, (300, 400, 3)).astype(np.uint8)
+
+
+def steepest(texture: NDArray[np.float32]) -> float:
+    """The largest step between neighbours, as a part of all contrast."""
+    steps = max(float(np.abs(np.diff(texture, axis=axis)).max()) for axis in (0, 1))
+    return steps / max(float(np.ptp(texture)), 0.05)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KIND_SHARES if kind != "noise"])
+def test_a_texture_has_edges_as_sharp_as_pixels_allow(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(textures, "KIND_SHARES", {kind: 1.0})
+    monkeypatch.setattr(textures, "FADED_SHARE", 0.0)
+    drawn = [draw_texture(np.random.default_rng(seed), [PHOTOGRAPH], SIZE) for seed in range(12)]
+    assert np.median([steepest(texture) for texture in drawn]) > 0.35
+    for texture in drawn:
+        assert texture.shape == (SIZE, SIZE, 3)
+        assert 0 <= texture.min() <= texture.max() <= 1
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_a_pattern_repeats(pattern: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Moved by its period a pattern is itself again: its autocorrelation has a second peak."""
+    monkeypatch.setattr(textures, "PATTERNS", (pattern,))
+    monkeypatch.setattr(textures, "BENT_SHARE", 0.0)
+    monkeypatch.setattr(textures, "PERIOD_PX", (8.0, 24.0))
+    for seed in range(4):
+        grey = textures._pattern(np.random.default_rng(seed), SIZE).mean(2)
+        power = np.abs(np.fft.rfft2(grey - grey.mean())) ** 2
+        likeness = np.fft.irfft2(power, s=grey.shape) / power.mean() / 2
+        away = np.hypot(*np.meshgrid(*[np.minimum(np.arange(SIZE), SIZE - np.arange(SIZE))] * 2)) > SIZE / 4
+        assert likeness[away].max() > 0.3 * likeness[0, 0]
+
+
+def test_what_is_plain_has_no_edge() -> None:
+    for seed in range(12):
+        texture = plain_texture(np.random.default_rng(seed), np.array([0.5, 0.4, 0.3], np.float32), SIZE)
+        assert max(float(np.abs(np.diff(texture, axis=axis)).max()) for axis in (0, 1)) < 0.1
