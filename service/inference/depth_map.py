@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from service.inference.artifact import Manifest
 from service.inference.pair import RawMaps, Side
 from service.inference.part import Part
-from service.inference.resampling import Ratio, sample
+from service.inference.resampling import Ratio, bands, sample
 from service.optics import thin_lens
 from service.optics.camera import Camera
 
@@ -108,6 +108,10 @@ class Layers:
     sigma_m: Array
     blur_px: Array
 
+    def of(self, rows: slice) -> "Layers":
+        """Some rows of all layers, not copied."""
+        return Layers(*(getattr(self, name)[rows] for name in self.__slots__))
+
     def take(self, other: "Layers", where: NDArray[np.bool_]) -> None:
         """Copy layers of the same size where told."""
         for name in self.__slots__:
@@ -125,34 +129,43 @@ class Layers:
 
 def decide(readings: list[Reading], size: tuple[int, int], side: Side) -> tuple[Layers, NDArray[np.bool_]]:
     """Layers (height, width) and which pixels have an answer; the surest reading wins, pixel by pixel."""
-    layers, *others = (_told(reading, size, side) for reading in readings)
-    for told in others:
-        layers.take(told, told.sigma_m < layers.sigma_m)
-    np.multiply(layers.sigma_m, layers.depth_m, out=layers.sigma_m)
-    return layers, layers.hide_unanswered()
+    sampled = [_sampled(reading, size) for reading in readings]
+    valid = np.empty(size, np.bool_)
+    for rows in bands(size):
+        layers, *others = (
+            _told(all_rows.of(rows), reading, side) for all_rows, reading in zip(sampled, readings, strict=True)
+        )
+        for told in others:
+            layers.take(told, told.sigma_m < layers.sigma_m)
+        np.multiply(layers.sigma_m, layers.depth_m, out=layers.sigma_m)
+        valid[rows] = layers.hide_unanswered()
+    return sampled[0], valid
 
 
-def _told(reading: Reading, size: tuple[int, int], side: Side) -> Layers:
-    """Layers from one reading, whose ``sigma_m`` is relative yet.
+def _sampled(reading: Reading, size: tuple[int, int]) -> Layers:
+    """What one reading says at every pixel: as depth the near hypothesis yet, as the other the far one."""
+    maps = reading.near_m, reading.far_m, reading.maps["p_near"], reading.error, reading.maps["blur_px"]
+    return Layers(*(sample(values, reading.ratio, size) for values in maps))
+
+
+def _told(layers: Layers, reading: Reading, side: Side) -> Layers:
+    """The layers with depth where it is, ``sigma_m`` relative yet.
 
     The side is what the network tells unless it is given; where no far answer can exist it is near, always. No error
     is stated below the floor of optics.
     """
-    near_m, far_m, error, p_near, blur_px = (
-        sample(values, reading.ratio, size)
-        for values in (reading.near_m, reading.far_m, reading.error, reading.maps["p_near"], reading.maps["blur_px"])
-    )
+    near_m, far_m, p_near, error = layers.depth_m, layers.depth_alt_m, layers.p_near, layers.sigma_m
     if side != "auto":
         p_near.fill(side == "near")
     np.copyto(p_near, 1, where=np.isnan(far_m))
-    is_near = p_near >= 0.5
-    depth_m = np.where(is_near, near_m, far_m)
-    other_m = near_m
-    np.copyto(other_m, far_m, where=is_near)
+    is_far = p_near < 0.5
+    depth_m = np.where(is_far, far_m, near_m)
+    np.copyto(far_m, near_m, where=is_far)
+    near_m[:] = depth_m
     camera = reading.camera
     floor = thin_lens.depth_error(1.0, camera.focus_distance_m, camera.k_cam_px, LEAST_BLUR_ERROR_PX)
     np.fmax(error, np.float32(floor) * depth_m, out=error)
     nearest_m, farthest_m = reading.trained_m
     error[(depth_m < nearest_m) | (depth_m > farthest_m)] = NO_ANSWER
-    blur_px /= np.float32(reading.scale)
-    return Layers(depth_m, other_m, p_near, error, blur_px)
+    np.divide(layers.blur_px, np.float32(reading.scale), out=layers.blur_px)
+    return layers

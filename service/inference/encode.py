@@ -17,6 +17,7 @@ from service.inference.depth_map import DepthMap
 from service.inference.part import Part
 from service.inference.png import grey_png
 from service.inference.preview import render_preview
+from service.inference.resampling import bands
 from service.opencv import cv2
 
 MILLIMETRE = 0.001
@@ -67,12 +68,17 @@ class Spread:
 
 def encode_png(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
     """16-bit grey, millimetres along z; 0 is no answer, which includes what lies beyond 65.535 m."""
-    millimetres = np.rint(np.nan_to_num(answer.depth_m, nan=0.0, posinf=0.0) / MILLIMETRE)
-    beyond = millimetres > LARGEST_MILLIMETRES
-    millimetres[beyond] = 0
-    body = grey_png(millimetres.astype(np.uint16))
-    lost = f"{beyond.mean():.1%} of the pixels lie beyond the 65.535 m a 16-bit PNG can hold and read 0"
-    return Encoded(body, MEDIA_TYPES["png"], MILLIMETRE, (lost,) if beyond.any() else ())
+    size = answer.height_px, answer.width_px
+    levels, beyond = np.empty(size, np.uint16), 0
+    for rows in bands(size):
+        millimetres = np.rint(answer.depth_m[rows] * np.float32(1 / MILLIMETRE))
+        too_far = millimetres > LARGEST_MILLIMETRES
+        beyond += int(np.count_nonzero(too_far))
+        millimetres[too_far | ~answer.valid[rows]] = 0
+        levels[rows] = millimetres
+    body = grey_png(levels)
+    lost = f"{beyond / levels.size:.1%} of the pixels lie beyond the 65.535 m a 16-bit PNG can hold and read 0"
+    return Encoded(body, MEDIA_TYPES["png"], MILLIMETRE, (lost,) if beyond else ())
 
 
 def encode_npy(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:

@@ -1,11 +1,14 @@
 """Maps at every pixel of the photograph: bilinear, with pixel centres where the conventions put them."""
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.opencv import cv2
+
+BAND_PX = 100_000
 
 
 class Ratio(NamedTuple):
@@ -21,6 +24,13 @@ class Ratio(NamedTuple):
     def between(cls, photograph_size: tuple[int, int], working_size: tuple[int, int], stride: int) -> "Ratio":
         """From a photograph (height, width) to a copy resized to another, whose map has a pixel per ``stride``."""
         return cls(*(working / (whole * stride) for whole, working in zip(photograph_size, working_size, strict=True)))
+
+
+def bands(size: tuple[int, int]) -> Iterator[slice]:
+    """Rows of an image (height, width), few enough at a time to stay in the processor's cache."""
+    height, width = size
+    rows = max(1, BAND_PX // width)
+    return (slice(top, min(top + rows, height)) for top in range(0, height, rows))
 
 
 def sample(values: NDArray[np.float32], ratio: Ratio, size: tuple[int, int]) -> NDArray[np.float32]:
