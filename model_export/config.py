@@ -40,7 +40,7 @@ class TrainConfig:
     decay_share: float = 0.5
     clip_norm: float = 1.0
     b_weight: float = 1.0
-    side_weight: float = 0.1
+    side_weight: float = 0.3
     pool: int = 600
     fresh_per_step: float = 1 / 3
     checkpoint_every: int = 250

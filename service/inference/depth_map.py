@@ -64,9 +64,9 @@ class DepthMap:
 class Reading:
     """Raw maps of one copy of the photograph, with the camera at that copy's size, and what they say at their cells.
 
-    ``near_m`` and ``far_m`` are both hypotheses, the far one NaN where there is none, and ``error`` that of depth,
-    relative: ``NO_ANSWER`` where the copy shows more blur than the model was trained on. ``trained_m`` are the nearest
-    and the farthest depth that it knows.
+    ``near_m`` and ``far_m`` are both hypotheses, the far one NaN where blur is too strong for it by more than two
+    standard deviations (beyond focus x stays below 1). ``error`` is that of depth, relative: ``NO_ANSWER`` where the
+    copy shows more blur than the model was trained on. ``trained_m`` are the nearest and the farthest depth it knows.
     """
 
     maps: RawMaps
@@ -81,17 +81,19 @@ class Reading:
     @classmethod
     def of(cls, maps: RawMaps, camera: Camera, photograph_size: tuple[int, int], manifest: Manifest) -> Self:
         """``photograph_size`` is (height, width)."""
-        x = thin_lens.relative_defocus_from_blur(maps["blur_px"], camera.gamma_px, camera.k_cam_px)
+        blur_px = maps["blur_px"]
+        at_least_px = blur_px * np.exp(-2 * SIGMA_OF_LAPLACE * np.exp(maps["blur_log_error"]))
+        least_x = thin_lens.relative_defocus_from_blur(at_least_px, camera.gamma_px, camera.k_cam_px)
         focus_m = np.float32(camera.focus_distance_m)
         error = np.exp(maps["log_scale"]) * (SIGMA_OF_LAPLACE * np.float32(manifest.temperature))
-        error[maps["blur_px"] > manifest.ranges.blur_px.high] = NO_ANSWER
+        error[blur_px > manifest.ranges.blur_px.high] = NO_ANSWER
         nearest, farthest = manifest.ranges.depth_ratio
         return cls(
             maps,
             camera,
             camera.image_width_px / photograph_size[1],
             np.exp(maps["log_ratio_near"]) * focus_m,
-            np.where(x < 1, np.exp(maps["log_ratio_far"]) * focus_m, np.float32(np.nan)),
+            np.where(least_x < 1, np.exp(maps["log_ratio_far"]) * focus_m, np.float32(np.nan)),
             error,
             (nearest * camera.focus_distance_m, farthest * camera.focus_distance_m),
             Ratio.between(photograph_size, (camera.image_height_px, camera.image_width_px), manifest.stride),

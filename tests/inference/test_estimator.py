@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from service.inference.artifact import Interval, load_model_folder
 from service.inference.cancellation import Cancellation, Cancelled
-from service.inference.depth_map import LEAST_BLUR_ERROR_PX
+from service.inference.depth_map import LEAST_BLUR_ERROR_PX, Reading
 from service.inference.estimator import Estimator
-from service.inference.pair import GraphPair, RawMaps, Side
+from service.inference.pair import MAPS, GraphPair, RawMaps, Side
 from service.inference.part import Part
 from service.inference.tiles import OVERLAP_PX
 from service.optics import thin_lens
@@ -82,6 +82,19 @@ def test_relative_defocus_of_one_and_more_is_near_whatever_is_asked(estimator: E
         np.testing.assert_allclose(answer.depth_m, thin_lens.depth_near(x, 2.0), rtol=1e-4)
         assert np.isnan(answer.depth_alt_m).all()
         assert (answer.p_near == 1).all()
+
+
+@pytest.mark.parametrize(
+    ("x", "relative_error", "may_be_beyond"), [(1.2, 0.05, False), (1.2, 0.2, True), (3.0, 0.2, False)]
+)
+def test_blur_no_surer_than_that_may_lie_beyond_focus_all_the_same(
+    folder: Path, x: float, relative_error: float, may_be_beyond: bool
+) -> None:
+    blur_px = thin_lens.blur_from_defocus(x * CAMERA.k_cam_px, CAMERA.gamma_px)
+    values = {name: 1.0 for name in MAPS} | {"blur_px": blur_px, "blur_log_error": float(np.log(relative_error))}
+    maps = {name: np.full((32, 48), value, np.float32) for name, value in values.items()}
+    reading = Reading.of(maps, CAMERA, (64, 96), load_model_folder(folder).manifest)
+    assert np.isfinite(reading.far_m).all() == may_be_beyond
 
 
 def test_auto_follows_the_features_handed_from_graph_to_graph(estimator: Estimator) -> None:
