@@ -91,7 +91,7 @@ def test_blur_no_surer_than_that_may_lie_beyond_focus_all_the_same(
     folder: Path, x: float, relative_error: float, may_be_beyond: bool
 ) -> None:
     blur_px = thin_lens.blur_from_defocus(x * CAMERA.k_cam_px, CAMERA.gamma_px)
-    values = {name: 1.0 for name in MAPS} | {"blur_px": blur_px, "blur_log_error": float(np.log(relative_error))}
+    values = dict.fromkeys(MAPS, 1.0) | {"blur_px": blur_px, "blur_log_error": float(np.log(relative_error))}
     maps = {name: np.full((32, 48), value, np.float32) for name, value in values.items()}
     reading = Reading.of(maps, CAMERA, (64, 96), load_model_folder(folder).manifest)
     assert np.isfinite(reading.far_m).all() == may_be_beyond
