@@ -24,6 +24,7 @@ from service.optics.camera import Camera, Intrinsics, Lens
 FRAME_FX_PX = 525.0
 UNSEEN_K_CAM_PX = (2.64, 3.81, 6.80, 10.7)
 FAR_K_CAM_PX = (1.0, 20.0, 60.0)
+LARGE_K_CAM_PX, LARGE_TIMES = 60.0, 4  # such a k_cam belongs to a photograph of many pixels
 FOCUS_DISTANCES_M = (0.6, 1.0, 4.0)
 PLANES_M = (0.7, 1.0, 1.5)
 VIEWS = (0.6, 0.8, 1.5)
@@ -141,6 +142,20 @@ def viewed_cases(folder: Path, count: int, view: float) -> Iterator[Case]:
         yield Case(photo.name, to_pixels(blurred), _to_limit(depth), camera, "near")
 
 
+def enlarged_cases(folder: Path, count: int, camera: Camera, times: int) -> Iterator[Case]:
+    """Refocused frames so many times their size, with the k_cam, gamma and intrinsics that they have there."""
+    for case in refocused_cases(folder, count, camera):
+        height, width = (size * times for size in case.truth_m.shape)
+        picture = cv2.resize(case.image, (width, height), interpolation=cv2.INTER_CUBIC)
+        truth = cv2.resize(case.truth_m, (width, height), interpolation=cv2.INTER_NEAREST)
+        yield replace(
+            case,
+            image=np.asarray(picture, np.uint8),
+            truth_m=np.asarray(truth, np.float32),
+            camera=camera.resized(width, height),
+        )
+
+
 def d200_cases(folder: Path, count: int) -> Iterator[Case]:
     """Real photographs of a real lens, known by its specs alone; scored away from depth steps and to 5 m."""
     for photo in _spread(folder, count):
@@ -254,6 +269,10 @@ def _indoor_trials(folder: Path, quick: bool) -> list[Trial]:
         return found
     for k_cam_px in FAR_K_CAM_PX:
         found += [_trial(f"{folder.name} k_cam {k_cam_px:g}", by(replace(REFERENCE, k_cam_px=k_cam_px), few))]
+    small = replace(REFERENCE, k_cam_px=LARGE_K_CAM_PX / LARGE_TIMES)
+    large = f"{REFERENCE.image_width_px * LARGE_TIMES}x{REFERENCE.image_height_px * LARGE_TIMES}"
+    enlarged = partial(enlarged_cases, folder, few, small, LARGE_TIMES)
+    found += [_trial(f"{folder.name} k_cam {LARGE_K_CAM_PX:g} of {large}", enlarged)]
     for focus_m in FOCUS_DISTANCES_M:
         camera = replace(REFERENCE, focus_distance_m=focus_m)
         found.append(_trial(f"{folder.name} focus {focus_m:g} m", by(camera, few, "auto")))
