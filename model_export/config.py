@@ -42,7 +42,7 @@ class TrainConfig:
     b_weight: float = 1.0
     side_weight: float = 0.3
     pool: int = 600
-    fresh_per_step: float = 1 / 3
+    fresh_per_step: float = 1.0
     checkpoint_every: int = 250
     settled_share: float = 0.35
     settle_batches: int = 60
