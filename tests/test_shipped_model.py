@@ -128,7 +128,7 @@ def test_tiles_show_no_seams() -> None:
     assert 0 < np.nanquantile(change, 0.98) < 0.01
 
 
-@pytest.mark.parametrize("seed", [11, 12, 14, 17])
+@pytest.mark.parametrize("seed", [11, 12, 21, 22])
 def test_textured_planes_stand_in_their_order_and_about_where_they_stand(estimator: Estimator, seed: int) -> None:
     """Leaves, noise and text that no training drew, by a camera it never met; ``camind evaluate`` measures."""
     assert is_textured(texture(seed))
