@@ -2,17 +2,15 @@
 
 import torch
 from torch import nn
+from torch.nn.utils import convert_conv2d_weight_memory_format
 
 from model_export.networks import make_pair
 from model_export.optimizers import Optimizers
 
 
-def channels_last(modules: nn.Module) -> nn.Module:
-    return modules.to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
-
-
 def test_a_step_moves_every_weight_that_has_a_gradient() -> None:
-    modules = channels_last(make_pair("compact").modules())
+    modules = make_pair("compact").modules()
+    convert_conv2d_weight_memory_format(modules, torch.channels_last)
     optimizers = Optimizers(modules, weight_decay=0.0)
     before = {name: p.detach().clone() for name, p in modules.named_parameters()}
     for p in modules.parameters():
@@ -25,7 +23,8 @@ def test_a_step_moves_every_weight_that_has_a_gradient() -> None:
 def test_a_step_of_filters_is_even_in_all_directions() -> None:
     torch.manual_seed(0)
     layer = nn.Conv2d(16, 8, 3)
-    modules = channels_last(nn.ModuleList([layer]))
+    modules = nn.ModuleList([layer])
+    convert_conv2d_weight_memory_format(modules, torch.channels_last)
     before = layer.weight.detach().clone()
     gradient = torch.outer(torch.randn(8), torch.randn(144)) + 0.1 * torch.randn(8, 144)
     layer.weight.grad = gradient.view_as(layer.weight)
