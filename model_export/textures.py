@@ -1,7 +1,8 @@
-"""Sharp textures for scenes: photographs, dead leaves, plain objects, noise of random slope, text, lines and patterns.
+"""Textures for scenes: photographs, dead leaves, plain objects, noise, text, lines, patterns, and clouds.
 
-Every texture is drawn at twice the size it is wanted and reduced by area, so it is as sharp as pixels allow:
-what blur a scene shows is then the renderer's alone.
+Most are drawn at twice the size they are wanted and reduced by area, so they are as sharp as pixels allow: what blur a
+scene shows is then the renderer's alone. Clouds are soft themselves, as marble, cloth and worn plaster are, and must
+not pass for blur.
 """
 
 from pathlib import Path
@@ -11,10 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 OVERSAMPLE = 2
-KIND_SHARES = {"photo": 0.37, "leaves": 0.16, "objects": 0.21, "noise": 0.05, "drawing": 0.1, "pattern": 0.11}
+KIND_SHARES = {
+    "photo": 0.33,
+    "leaves": 0.14,
+    "objects": 0.19,
+    "noise": 0.05,
+    "drawing": 0.08,
+    "pattern": 0.1,
+    "clouds": 0.11,
+}
 PATTERNS = ("stripes", "checks", "dots", "bricks", "waves")
 PERIOD_PX = (3.0, 60.0)
 BENT_SHARE = 0.4
+CLOUD_PX = (4.0, 60.0)
 FADED_SHARE = 0.45
 SHADED_SHARE = 0.5
 SOFT_SIGMA_PX = 4.0
@@ -214,7 +224,30 @@ def _pattern(rng: np.random.Generator, size: int) -> Image:
     return np.asarray(np.clip(ground + seen[..., None] * (motif - ground), 0, 1), np.float32)
 
 
-_DRAWN = {"leaves": _leaves, "objects": _objects, "drawing": _drawing, "pattern": _pattern, "noise": _noise}
+def _clouds(rng: np.random.Generator, size: int) -> Image:
+    """Two colours that run into each other in spots of one size, with or without finer ones among them."""
+    spot_px = float(np.exp(rng.uniform(*np.log(CLOUD_PX))))
+    finer = rng.uniform(0, 0.6) if rng.random() < 0.6 else 0.0
+    height = np.zeros((size, size), np.float32)
+    strength = 1.0
+    while spot_px >= CLOUD_PX[0] and strength > 0.03:
+        cells = np.maximum(2, np.round(size / spot_px * np.array([1.0, rng.uniform(0.3, 1.0)]))).astype(int)
+        field = rng.standard_normal(cells.tolist()).astype(np.float32)
+        height += np.float32(strength) * np.asarray(cv2.resize(field, (size, size), interpolation=cv2.INTER_CUBIC))
+        spot_px, strength = spot_px / 2, strength * finer
+    ground, other = _paint(rng), _paint(rng)
+    share = 0.5 + 0.5 * np.tanh(height * np.float32(rng.uniform(0.3, 1.5)))
+    return np.asarray(np.clip(ground + share[..., None] * (other - ground), 0, 1), np.float32)
+
+
+_DRAWN = {
+    "leaves": _leaves,
+    "objects": _objects,
+    "drawing": _drawing,
+    "pattern": _pattern,
+    "noise": _noise,
+    "clouds": _clouds,
+}
 
 
 def _smooth_field(rng: np.random.Generator, size: int) -> NDArray[np.float32]:

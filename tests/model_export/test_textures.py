@@ -16,7 +16,7 @@ def largest_step(texture: NDArray[np.float32]) -> float:
     return max(float(np.abs(np.diff(texture, axis=axis)).max()) for axis in (0, 1))
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KIND_SHARES if kind != "noise"])
+@pytest.mark.parametrize("kind", [kind for kind in KIND_SHARES if kind not in ("noise", "clouds")])
 def test_a_texture_has_edges_as_sharp_as_pixels_allow(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(textures, "KIND_SHARES", {kind: 1.0})
     monkeypatch.setattr(textures, "FADED_SHARE", 0.0)
@@ -39,6 +39,14 @@ def test_a_pattern_repeats(pattern: str, monkeypatch: pytest.MonkeyPatch) -> Non
         likeness = np.fft.irfft2(power, s=grey.shape) / power.mean() / 2
         away = np.hypot(*np.meshgrid(*[np.minimum(np.arange(SIZE), SIZE - np.arange(SIZE))] * 2)) > SIZE / 4
         assert likeness[away].max() > 0.3 * likeness[0, 0]
+
+
+def test_clouds_are_soft_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(textures, "KIND_SHARES", {"clouds": 1.0})
+    monkeypatch.setattr(textures, "FADED_SHARE", 0.0)
+    drawn = [draw_texture(np.random.default_rng(seed), [], SIZE) for seed in range(24)]
+    assert max(largest_step(texture) / max(float(np.ptp(texture)), 0.05) for texture in drawn) < 0.5
+    assert np.median([np.ptp(texture) for texture in drawn]) > 0.2
 
 
 def test_what_is_plain_has_no_edge() -> None:
