@@ -35,7 +35,8 @@ from model_export.textures import load_photographs
 FOCAL_UNKNOWN_SHARE = 0.3
 SIDE_HINT_SHARE = 0.5
 TURNED_SHARE = 0.3  # most are left upright: below is nearer, as in most photographs
-GUESSED_GAMMA_SHARE, GUESSED_GAMMA_SPREAD = 0.5, 0.3  # a camera known by its specs has a guess for gamma
+# a camera known by its specs has a guess for gamma: mostly too low a one, since motion, haze and filters add softness
+GUESSED_GAMMA_SHARE, GUESSED_GAMMA = 0.6, (-0.2, 0.35)  # mean and standard deviation of the guess's log error
 HELD_OUT_SEED = 2**40
 
 
@@ -117,7 +118,7 @@ def collate(samples: list[Sample], rng: np.random.Generator) -> Batch:
         shot = sample.shot
         focal = 0.0 if rng.random() < FOCAL_UNKNOWN_SHARE else shot.focal_length_px
         side = shot.side if rng.random() < SIDE_HINT_SHARE else 0
-        guess = math.exp(rng.normal(0, GUESSED_GAMMA_SPREAD)) if rng.random() < GUESSED_GAMMA_SHARE else 1.0
+        guess = math.exp(rng.normal(*GUESSED_GAMMA)) if rng.random() < GUESSED_GAMMA_SHARE else 1.0
         rows.append((shot.k_cam_px, shot.gamma_px, guess * shot.gamma_px, shot.focus_distance_m, focal, side))
     columns = torch.tensor(rows, dtype=torch.float32).unbind(1)
     image = torch.from_numpy(np.stack(images)).float() / 255
