@@ -31,6 +31,7 @@ LEVEL_SHARE = 0.5
 LAYERED_SHARE = 0.7
 NEAREST_AT_MOST, FARTHEST_AT_LEAST = 0.5, 2.0
 CLOSE_SHARE = 0.5
+FOCUSED_SHARE = 0.2  # somebody focused on something: sharp is read as blurred by who seldom saw it
 K_CAM_LEAN = 0.5  # so that every octave of blur has about its share: what is rare is read as what is common
 DISC_SHARE, GAUSSIAN_SHARE = 0.4, 0.3  # opened-up lenses have discs, soft ones come near a bell
 ROUND_SHARE = 0.7
@@ -88,7 +89,7 @@ def draw_shot(rng: np.random.Generator, config: SceneConfig) -> Shot:
     k_cam_px = _log_uniform(rng, config.k_cam_px, K_CAM_LEAN)
     return Shot(
         k_cam_px=k_cam_px,
-        gamma_px=rng.uniform(*config.gamma_px),
+        gamma_px=_log_uniform(rng, config.gamma_px),
         focus_distance_m=focus_distance_m,
         focal_length_px=_log_uniform(rng, config.focal_length_px),
         spread=_draw_spread(rng, k_cam_px),
@@ -124,12 +125,15 @@ def _excess_bounds(shot: Shot, config: SceneConfig) -> tuple[float, float]:
 
 
 def _draw_excess(rng: np.random.Generator, shot: Shot, config: SceneConfig) -> float:
-    """q - 1 of one surface: half of the time uniform in blur, else log-uniform, on a side the shot has."""
+    """q - 1 of one surface on a side of the shot: at times in focus, else uniform or log-uniform in blur."""
     low, high = _excess_bounds(shot, config)
     far = shot.side > 0 or (shot.side == 0 and rng.random() < 0.5)
     end = -low if far else high
     first = min(config.defocus_px[0] / shot.k_cam_px, end / 2)
-    amount = rng.uniform(0, end) if rng.random() < 0.5 else _log_uniform(rng, (first, end))
+    if rng.random() < FOCUSED_SHARE:
+        amount = rng.uniform(0, first)
+    else:
+        amount = rng.uniform(0, end) if rng.random() < 0.5 else _log_uniform(rng, (first, end))
     return -amount if far else amount
 
 
