@@ -25,7 +25,8 @@ SIDE_VISIBLE_PX = 0.3
 class Batch:
     """Images [n,3,h,w] in 0..1, q - 1 = s1/z - 1 as [n,1,h,w], and per image [n] its camera and side (-1/0/+1).
 
-    ``told_gamma_px`` is what the correction is given: a guess where gamma is not known.
+    ``told_gamma_px`` is what the correction is given: a guess where gamma is not known. ``side`` is the one
+    asked for, 0 for both: the other may be in the picture.
     """
 
     image: Tensor
@@ -83,10 +84,11 @@ def total_loss(pair: Pair, batch: Batch, config: TrainConfig) -> tuple[Tensor, d
     is_near = (excess > 0).float()
     log_ratio = torch.where(excess > 0, depth.log_ratio_near, depth.log_ratio_far)
     depth_error = (log_ratio + torch.log1p(excess)).abs()
-    side_seen = (defocus_px > SIDE_VISIBLE_PX).float()
+    asked = (batch.side[:, None, None, None] * excess <= 0).float()
+    side_seen = asked * (defocus_px > SIDE_VISIBLE_PX)
     side = functional.binary_cross_entropy_with_logits(depth.near_logit, is_near, weight=side_seen)
     blur_loss = laplace(blur_error, blur.log_error).mean()
-    depth_loss = laplace(depth_error, depth.log_scale).mean()
+    depth_loss = (asked * laplace(depth_error, depth.log_scale)).mean()
     loss = depth_loss + config.b_weight * blur_loss + config.side_weight * side
-    parts = {"loss": loss, "blur": blur_error.mean(), "depth": depth_error.mean(), "side": side}
+    parts = {"loss": loss, "blur": blur_error.mean(), "depth": (asked * depth_error).sum() / asked.sum(), "side": side}
     return loss, {name: part.detach() for name, part in parts.items()}

@@ -108,7 +108,10 @@ class Pool:
 
 
 def collate(samples: list[Sample], rng: np.random.Generator) -> Batch:
-    """Samples to tensors, flipped and turned at random, focal length and side shown or not, gamma told or guessed."""
+    """Samples to tensors, flipped and turned at random, focal length shown or not, gamma told or guessed.
+
+    A side is asked for at times, of scenes on both sides either: a near thing may stand before a far background.
+    """
     images, excesses, rows = [], [], []
     for sample in samples:
         turns = int(rng.integers(4)) if rng.random() < TURNED_SHARE else 0
@@ -117,7 +120,7 @@ def collate(samples: list[Sample], rng: np.random.Generator) -> Batch:
         excesses.append(np.rot90(sample.excess, turns)[:, ::flip].astype(np.float32))
         shot = sample.shot
         focal = 0.0 if rng.random() < FOCAL_UNKNOWN_SHARE else shot.focal_length_px
-        side = shot.side if rng.random() < SIDE_HINT_SHARE else 0
+        side = (shot.side or int(rng.choice([-1, 1]))) if rng.random() < SIDE_HINT_SHARE else 0
         guess = math.exp(rng.normal(*GUESSED_GAMMA)) if rng.random() < GUESSED_GAMMA_SHARE else 1.0
         rows.append((shot.k_cam_px, shot.gamma_px, guess * shot.gamma_px, shot.focus_distance_m, focal, side))
     columns = torch.tensor(rows, dtype=torch.float32).unbind(1)

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from io import StringIO
+from itertools import count
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,8 @@ from rich.console import Console
 
 from model_export.config import SceneConfig, TrainConfig
 from model_export.folded import folded
-from model_export.losses import run_pair
+from model_export.losses import run_pair, total_loss
+from model_export.networks import make_pair
 from model_export.restored import restored, spread_norms
 from model_export.scenes import draw_sample
 from model_export.textures import load_photographs
@@ -127,6 +129,23 @@ def test_statistics_follow_the_batches_until_they_are_settled() -> None:
         return any(not torch.equal(after[name], value) for name, value in before.items())
 
     assert [moved() for _ in range(CONFIG.steps)] == [step < settling_step(CONFIG) for step in range(CONFIG.steps)]
+
+
+def test_what_lies_on_the_side_that_nobody_asked_for_moves_no_depth() -> None:
+    pair = make_pair("compact")
+    samples = (draw_sample(seed, SCENES, []) for seed in count())
+    both = next(s for s in samples if s.shot.side == 0 and s.excess.min() < 0 < s.excess.max())
+    batch = collate([both], np.random.default_rng(0))
+    config = replace(CONFIG, b_weight=0.0)
+
+    def moved(side: int) -> bool:
+        farther = torch.where(batch.excess < 0, 1.5 * batch.excess, batch.excess)
+        told = replace(batch, side=torch.tensor([float(side)]))
+        losses = [total_loss(pair, each, config)[0] for each in (told, replace(told, excess=farther))]
+        return bool(losses[0] != losses[1])
+
+    pair.modules().eval()
+    assert [moved(side) for side in (-1, 0, 1)] == [False, True, True]
 
 
 def test_a_few_steps_on_one_batch_lower_the_loss() -> None:
