@@ -3,7 +3,9 @@
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from functools import partial
 from importlib.metadata import version
+from typing import Any
 
 from fastapi import FastAPI
 from fastapi_offline import FastAPIOffline
@@ -69,7 +71,8 @@ def create_app(settings: Settings, calibrate: Calibrate = calibrate) -> FastAPI:
     for part in (cameras, depth, calibrations, look, target, model, health, metrics, pages):
         app.include_router(part.router)
     # FastAPI's own way to another description: https://fastapi.tiangolo.com/how-to/extending-openapi/
-    app.openapi = lambda: openapi.describe(app)  # type: ignore[method-assign]
+    replaceable: Any = app
+    replaceable.openapi = partial(openapi.describe, app)
     return app
 
 
