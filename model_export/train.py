@@ -24,6 +24,7 @@ from torch.nn.utils import convert_conv2d_weight_memory_format
 from torch.utils.data import DataLoader, Dataset
 
 from model_export.config import Kind, SceneConfig, TrainConfig
+from model_export.cores import torch_threads
 from model_export.losses import Batch, run_pair, total_loss
 from model_export.networks import Pair, make_pair
 from model_export.optimizers import Optimizers
@@ -31,6 +32,7 @@ from model_export.progress import progress_bar
 from model_export.restored import restored, spread_norms
 from model_export.scenes import Sample, draw_sample
 from model_export.textures import load_photographs
+from service.cores import available_cores
 
 FOCAL_UNKNOWN_SHARE = 0.3
 SIDE_HINT_SHARE = 0.5
@@ -326,7 +328,9 @@ def train(
     start = starting_pair(weights, config.kind) if weights is not None and resume is None else None
     pool = Pool(config, photographs, trainer.step, workers)
     test = held_out(config.scenes, photographs, 2 * config.batch)
-    with progress_bar(console) as progress:
+    # two busy processes on one core cost each far more than half its speed
+    threads = max(1, available_cores() - workers)
+    with torch_threads(threads), progress_bar(console) as progress:
         for _ in progress.track(pool.fill(), total=config.pool, description="scenes"):
             pass
         if start is not None and weights is not None:

@@ -11,6 +11,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, ValidationError, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+from service.cores import available_cores
+
 ENV_PREFIX = "CAMIND_"
 SHIPPED_MODEL = Path(__file__).parent / "models"
 INT8 = "int8"  # the folder, in a model folder, of the same model in int8
@@ -20,11 +22,6 @@ DATABASE_SCHEMES = ("sqlite", "postgresql+psycopg")
 
 class SettingsError(ValueError):
     """A setting that cannot be served with; the message names the variable and its bound."""
-
-
-def available_cores() -> int:
-    """Processor cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def default_data_dir() -> Path:

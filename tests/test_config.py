@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from service.config import SHIPPED_MODEL, Settings, SettingsError, available_cores, load_settings
+from service.config import SHIPPED_MODEL, Settings, SettingsError, load_settings
+from service.cores import available_cores
 
 
 @pytest.fixture(autouse=True)

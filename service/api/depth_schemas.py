@@ -29,7 +29,7 @@ class DepthQuery(BaseModel):
 
     camera: Annotated[str, Field(min_length=1, max_length=200, description="Name of the camera that took it")]
     side: Annotated[
-        Side, Field(description="Where everything is: nearer than the plane in focus, beyond it, or unknown")
+        Side, Field(description="Where what is measured lies: nearer than the plane in focus, beyond it, or unknown")
     ] = "auto"
     format: Annotated[
         Literal["png", "npy", "npz", "tiff", "ply", "preview", "json"] | None,

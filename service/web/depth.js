@@ -34,8 +34,8 @@ import { html, useCallback, useEffect, useMemo, useRef, useState } from "./vendo
 
 const SIDES = [
   ["auto", "Let the model decide"],
-  ["near", "All nearer than focus"],
-  ["far", "All beyond focus"],
+  ["near", "Nearer than focus"],
+  ["far", "Beyond focus"],
 ];
 const PHOTOGRAPH_MOST_PX = 1600;
 const NOT_THE_FRAME = "urn:camind:problem:image-size-mismatch";
