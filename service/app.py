@@ -152,6 +152,7 @@ def _stop(app: FastAPI) -> None:
     app.state.metrics.watch(None)
     app.state.runner.close()
     app.state.worker.close()
+    app.state.estimator.close()
     app.state.engine.dispose()
     if app.state.tracing is not None:
         app.state.tracing.close()

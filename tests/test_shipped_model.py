@@ -2,6 +2,8 @@
 
 import io
 import json
+import resource
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,6 +28,7 @@ from service.optics.camera import Camera
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "coffee.jpg"
 MAX_BYTES = 12_000_000
 MAX_PEAK_BYTES = 600_000_000
+LARGE_PICTURES_BYTES = 150_000_000
 D200 = {
     "name": "d200",
     "image_width_px": 645,
@@ -127,6 +130,25 @@ def test_tiles_show_no_seams() -> None:
     whole, tiled = (Estimator(pair, budget).estimate(picture, camera, "near").depth_m for budget in (10**6, 550_000))
     change = np.abs(np.log(np.divide(tiled, whole)))
     assert 0 < np.nanquantile(change, 0.98) < 0.01
+
+
+def test_what_a_large_picture_took_is_kept_a_while_and_given_back() -> None:
+    estimator = Estimator(GraphPair(load_model_folder(SHIPPED_MODEL), 1), kept_s=2)
+    picture = np.asarray(cv2.resize(to_pixels(texture(1)), (1600, 1200)), np.uint8)
+    estimator.estimate(picture, Camera(1600, 1200, 2.0, 5.0, 0.6))
+    taken = memory_bytes()
+    time.sleep(0.5)
+    assert memory_bytes() > taken - LARGE_PICTURES_BYTES
+    deadline = time.monotonic() + 30
+    while memory_bytes() > taken - LARGE_PICTURES_BYTES:
+        assert time.monotonic() < deadline, "it was never given back"
+        time.sleep(0.1)
+
+
+def memory_bytes() -> int:
+    """What this process has in memory."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize()
 
 
 @pytest.mark.parametrize("seed", [0, 3, 4, 6])

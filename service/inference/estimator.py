@@ -1,5 +1,6 @@
-"""A photograph and its camera to depth: chooses the scale, reads, decides. Pure and stateless."""
+"""A photograph and its camera to depth: chooses the scale, reads, decides. No answer depends on another."""
 
+import threading
 from typing import Self
 
 import numpy as np
@@ -7,7 +8,7 @@ from numpy.typing import NDArray
 
 from service.inference.artifact import Interval, Manifest, ModelFolder
 from service.inference.cancellation import Cancellation
-from service.inference.depth_map import DepthMap, Layers, Reading, decide
+from service.inference.depth_map import DepthMap, Reading, all_layers, decide
 from service.inference.pair import GraphPair, Side, Stopwatch
 from service.inference.part import Part
 from service.inference.tiles import OVERLAP_PX, PIXEL_BUDGET, read_in_tiles
@@ -22,16 +23,19 @@ HIGH_BLUR_FRACTION = 0.02
 SECOND_SCALE = 1 / 3
 LEAST_CHANGE_OF_SCALE = 0.7
 FEW_ANSWERS = 0.5
-KEPT_MEMORY_PX = 600_000
+SMALL_PX = 600_000
+KEPT_S = 10.0
 WARM_UP_PX = 64
 
 
 class Estimator:
     """Made once from a model folder; ``estimate`` may be called from several threads at once."""
 
-    def __init__(self, pair: GraphPair, pixel_budget: int = PIXEL_BUDGET) -> None:
+    def __init__(self, pair: GraphPair, pixel_budget: int = PIXEL_BUDGET, kept_s: float = KEPT_S) -> None:
         self._pair = pair
         self._pixel_budget = pixel_budget
+        self._kept_s = kept_s
+        self._freeing = threading.Timer(0, pair.free_memory)
 
     @classmethod
     def from_folder(cls, folder: ModelFolder, *, intra_op_threads: int = 1) -> Self:
@@ -47,6 +51,10 @@ class Estimator:
         grey = np.full((WARM_UP_PX, WARM_UP_PX, 3), 128, np.uint8)
         middle = float(np.mean(self.manifest.ranges.focus_distance_m))
         self.estimate(grey, Camera(WARM_UP_PX, WARM_UP_PX, middle, self.manifest.ranges.k_cam_px.high))
+
+    def close(self) -> None:
+        """Nothing happens later any more."""
+        self._freeing.cancel()
 
     def estimate(
         self,
@@ -75,19 +83,27 @@ class Estimator:
         second = self._second_scale(readings[0])
         if second is not None:
             readings.append(self._read(rgb, camera, second, side, cancellation, stopwatch))
-        if height * width > KEPT_MEMORY_PX:
-            self._pair.free_memory()
+        if height * width > SMALL_PX:
+            self._free_memory_later()
         cancellation.check()
         with stopwatch.stage("encode"):
-            layers, valid = decide(readings, (height, width), side)
+            depth_m, valid = decide(readings, (height, width), side)
         return DepthMap(
-            **{name: getattr(layers, name) for name in Layers.__slots__},
+            depth_m=depth_m,
             valid=valid,
+            layers=all_layers(readings, (height, width), side),
             camera=camera,
             scales=tuple(reading.scale for reading in readings),
             warnings=(*self._warnings(readings), *_sparseness(valid)),
             timings_ms=stopwatch.elapsed_ms,
         )
+
+    def _free_memory_later(self) -> None:
+        """What a large picture has taken is kept for the next one, but for a while only."""
+        self._freeing.cancel()
+        self._freeing = threading.Timer(self._kept_s, self._pair.free_memory)
+        self._freeing.daemon = True
+        self._freeing.start()
 
     def _base_scale(self, camera: Camera) -> float:
         """The largest copy whose k_cam the model reads well; never an enlarged one."""
@@ -96,7 +112,7 @@ class Estimator:
     def _second_scale(self, first: Reading) -> float | None:
         """A smaller copy, where the first shows more blur than the model reads well; None without need."""
         ranges = self.manifest.ranges
-        if (first.maps["blur_px"] > HIGH_BLUR * ranges.blur_px.high).mean() <= HIGH_BLUR_FRACTION:
+        if (first.blur_px > HIGH_BLUR * ranges.blur_px.high).mean() <= HIGH_BLUR_FRACTION:
             return None
         change = max(SECOND_SCALE, ranges.k_cam_px.low / first.camera.k_cam_px)
         return first.scale * change if change <= LEAST_CHANGE_OF_SCALE else None
@@ -137,7 +153,7 @@ class Estimator:
         told += _outside("focus_distance_m", first.camera.focus_distance_m, ranges.focus_distance_m)
         if first.camera.intrinsics:
             told += _outside("fx_px at that size", first.camera.intrinsics.fx_px, ranges.focal_length_px)
-        blurrier = float((last.maps["blur_px"] > ranges.blur_px.high).mean())
+        blurrier = float((last.blur_px > ranges.blur_px.high).mean())
         if blurrier > HIGH_BLUR_FRACTION:
             told.append(f"{blurrier:.0%} of the pixels show more blur than the model was trained on")
         return told

@@ -33,7 +33,13 @@ def bands(size: tuple[int, int]) -> Iterator[slice]:
     return (slice(top, min(top + rows, height)) for top in range(0, height, rows))
 
 
-def sample(values: NDArray[np.float32], ratio: Ratio, size: tuple[int, int]) -> NDArray[np.float32]:
-    """The map [h, w] at every pixel of a photograph of that size (height, width); its edges are continued."""
-    large = cv2.resize(values, None, fx=1 / ratio.columns, fy=1 / ratio.rows, interpolation=cv2.INTER_LINEAR)
-    return np.asarray(large, np.float32)[: size[0], : size[1]]
+def sample(values: NDArray[np.float32], ratio: Ratio, rows: slice, width: int) -> NDArray[np.float32]:
+    """The map [h, w] at some rows of a photograph so many pixels wide; its edges are continued."""
+    at = (np.arange(rows.start, rows.stop) + 0.5) * ratio.rows - 0.5
+    above = np.floor(at).astype(np.intp)
+    upper, lower = (values.take(above + i, axis=0, mode="clip") for i in (0, 1))
+    lower -= upper
+    lower *= (at - above).astype(np.float32)[:, np.newaxis]
+    upper += lower
+    wide = cv2.resize(upper, None, fx=1 / ratio.columns, fy=1, interpolation=cv2.INTER_LINEAR)
+    return np.asarray(wide, np.float32)[:, :width]

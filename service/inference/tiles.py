@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-PIXEL_BUDGET = 2_600_000
+PIXEL_BUDGET = 6_500_000
 OVERLAP_PX = 224
 
 Maps = dict[str, NDArray[np.float32]]

@@ -9,7 +9,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from service.errors import BadRequest
-from service.inference.depth_map import DepthMap
+from service.inference.depth_map import DepthMap, Layers
 from service.inference.encode import (
     ENCODERS,
     MEDIA_TYPES,
@@ -36,13 +36,11 @@ def answer() -> DepthMap:
     depth_m[0, 0] = np.nan
     alt_m = np.where(depth_m > 3, np.nan, depth_m * 2).astype(np.float32)
     ones = np.ones_like(depth_m)
+    layers = Layers(depth_m, alt_m, ones * np.float32(0.75), depth_m * np.float32(0.1), ones)
     return DepthMap(
         depth_m=depth_m,
-        depth_alt_m=alt_m,
-        p_near=ones * np.float32(0.75),
-        sigma_m=depth_m * np.float32(0.1),
-        blur_px=ones,
         valid=np.isfinite(depth_m),
+        layers=lambda: layers,
         camera=CAMERA,
         scales=(1.0,),
         warnings=(),
