@@ -75,14 +75,9 @@ def feature_names(count: int) -> tuple[str, ...]:
     return ("features",) if count == 1 else tuple(f"features_{i}" for i in range(count))
 
 
-def export_graphs(pair: Pair, folder: Path, *, fold: bool = True) -> Graphs:
-    """Write both graphs for any batch and any size that is a multiple of 16; what the manifest says of them.
-
-    Folded they are fastest in float32.
-    """
-    pair.modules().eval()
-    if fold:
-        pair = folded(pair)
+def export_graphs(pair: Pair, folder: Path) -> Graphs:
+    """Write both graphs for any batch and any size that is a multiple of 16; what the manifest says of them."""
+    pair = folded(pair)
     height, width = EXAMPLE_SIZE
     image = torch.rand(2, 3, height, width)
     with torch.inference_mode():

@@ -6,6 +6,7 @@ distance, the focal length in pixels, a side hint and those features to ln(z / s
 probability of near, and the log of the relative error. All maps are [n,1,h/s,w/s] with s the pair's stride.
 """
 
+import functools
 import itertools
 import math
 from collections.abc import Iterable
@@ -77,7 +78,9 @@ class BandEnergy(nn.Module):
 
     Bands are differences of Gaussians on a pyramid whose next level starts where this one's Gaussian has
     doubled, so each octave costs a quarter of the one before; each energy is smoothed at 1.2 px of its level.
-    Every Gaussian is a row and a column.
+    Beyond the picture its edge goes on. The first octave is computed in cells of 2x2: its energies are needed at half
+    size alone, so every band is four maps of that size, which the smoothing sums. The last of the maps that are seen is
+    the next level.
     """
 
     OCTAVES = 4
@@ -86,52 +89,138 @@ class BandEnergy(nn.Module):
     SMOOTH_SIGMA = 1.2
     RADIUS = 4
     FLOOR = 1e-6
-    first: Tensor
-    rest: Tensor
-    smooth: Tensor
     luminance: Tensor
+    first_bands: Tensor
+    first_rows: Tensor
+    first_columns: Tensor
+    bands: Tensor
+    rows: Tensor
+    columns: Tensor
 
     def __init__(self) -> None:
         super().__init__()
         sigmas = [self.FIRST_SIGMA * 2 ** (i / self.BANDS) for i in range(self.BANDS + 1)]
         # later levels start from a picture that is blurred by FIRST_SIGMA already
         more = [max(s * s - self.FIRST_SIGMA**2, 0.0) ** 0.5 for s in sigmas]
-        self._keep("first", torch.stack([_gaussian(s, self.RADIUS) for s in sigmas]))
-        self._keep("rest", torch.stack([_gaussian(s, self.RADIUS) for s in more]))
-        self._keep("smooth", _gaussian(self.SMOOTH_SIGMA, self.RADIUS).repeat(self.BANDS, 1))
-        self._keep("luminance", torch.tensor(LUMINANCE)[None, :, None, None])
+        smooth = _gaussian(self.SMOOTH_SIGMA, self.RADIUS)
+        self._keep("luminance", torch.tensor(LUMINANCE)[None])
+        self._keep("first_bands", _in_cells(self._kernels(sigmas)))
+        self._keep("first_rows", _cell_sums(smooth, 2 * self.BANDS).transpose(2, 3))
+        self._keep("first_columns", _cell_sums(smooth, self.BANDS))
+        self._keep("bands", self._kernels(more))
+        self._keep("rows", smooth.repeat(self.BANDS, 1)[:, None, None, :])
+        self._keep("columns", smooth.repeat(self.BANDS, 1)[:, None, :, None])
+
+    def _kernels(self, sigmas: list[float]) -> Tensor:
+        """The bands between neighbours among Gaussians, and the last Gaussian [b+1,1,t,t]."""
+        squares = [torch.outer(g, g) for g in (_gaussian(s, self.RADIUS) for s in sigmas)]
+        return torch.stack([*(a - b for a, b in itertools.pairwise(squares)), squares[-1]])[:, None]
 
     def _keep(self, name: str, values: Tensor) -> None:
         self.register_buffer(name, values.float(), persistent=False)
 
     def forward(self, image: Tensor) -> Tensor:
-        level = (image * self.luminance).sum(1, keepdim=True)
+        n, c, h, w = image.shape
+        level = torch.matmul(self.luminance, image.reshape(n, c, h * w)).reshape(n, 1, h, w)
         energies = []
         for octave in range(self.OCTAVES):
-            blurred = self._blurred(level, self.first if octave == 0 else self.rest)
-            bands = blurred[:, :-1] - blurred[:, 1:]
-            energy = torch.log(self._blurred(bands**2, self.smooth, stride=2 if octave == 0 else 1) + self.FLOOR)
+            # room for a band and for the smoothing of its energy
+            padded = functional.pad(level, (2 * self.RADIUS,) * 4, mode="replicate")
+            if octave == 0:
+                seen = functional.conv2d(padded, self.first_bands, stride=2)
+                squares = seen[:, : 4 * self.BANDS] ** 2
+                energy = functional.conv2d(functional.conv2d(squares, self.first_rows), self.first_columns)
+                margin, step = self.RADIUS // 2, 1
+            else:
+                seen = functional.conv2d(padded, self.bands)
+                rows = functional.conv2d(seen[:, : self.BANDS] ** 2, self.rows, groups=self.BANDS)
+                energy = functional.conv2d(rows, self.columns, groups=self.BANDS)
+                margin, step = self.RADIUS, 2
+            level = seen[:, -1:, margin:-margin:step, margin:-margin:step]
+            energy = torch.log(energy + self.FLOOR)
             if octave > 1:
                 factor = 2.0 ** (octave - 1)
                 energy = functional.interpolate(energy, scale_factor=factor, mode="bilinear", align_corners=False)
-            energies.append(energy * 0.25 + 2.0)
-            level = blurred[:, -1:, ::2, ::2]
-        return torch.cat(energies, 1)
-
-    def _blurred(self, maps: Tensor, taps: Tensor, stride: int = 1) -> Tensor:
-        """Maps [n,1 or c,h,w] by the Gaussians of taps [c,t]: [n,c,h/stride,w/stride], edges continued."""
-        padded = functional.pad(maps, (self.RADIUS,) * 4, mode="replicate")
-        rows = functional.conv2d(padded, taps[:, None, None, :], stride=(1, stride), groups=maps.shape[1])
-        return functional.conv2d(rows, taps[:, None, :, None], stride=(stride, 1), groups=taps.shape[0])
+            energies.append(energy)
+        return torch.cat(energies, 1) * 0.25 + 2.0
 
 
-def conv_block(inputs: int, outputs: int, convolutions: int = 2) -> nn.Sequential:
-    """3x3 convolution, batch norm and ReLU, as often as said."""
-    layers: list[nn.Module] = []
-    for i in range(convolutions):
-        layers.append(nn.Conv2d(outputs if i else inputs, outputs, 3, padding=1, bias=False))
-        layers += [nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)]
-    return nn.Sequential(*layers)
+def _in_cells(kernels: Tensor) -> Tensor:
+    """Kernels [k,1,t,t] for every other pixel [4k-3,1,t+1,t+1]: all but the last of each pixel in a cell of 2x2."""
+    placed = torch.stack([functional.pad(kernels, (j, 1 - j, i, 1 - i)) for i in (0, 1) for j in (0, 1)], 1)
+    return torch.cat([placed[:-1].flatten(0, 1), placed[-1, :1]])
+
+
+def _cell_sums(taps: Tensor, sums: int) -> Tensor:
+    """What taps [t] of pixels do to both pixels of a cell [sums, 2 sums, (t+1)/2, 1]: each sum has its own two maps."""
+    of_cells = torch.cat([taps, taps.new_zeros(1)]).reshape(-1, 2)
+    kernels = taps.new_zeros(sums, sums, 2, len(of_cells), 1)
+    for number in range(sums):
+        kernels[number, number, :, :, 0] = of_cells.T
+    return kernels.flatten(1, 2)
+
+
+class Normed(nn.Module):
+    """Convolutions, each of a map of its own, added under one batch norm: nothing is joined before it is convolved."""
+
+    def __init__(self, *ways: nn.Module) -> None:
+        super().__init__()
+        self.ways = nn.ModuleList(ways)
+        self.norm: nn.Module = nn.BatchNorm2d(self.convolutions()[-1].out_channels)
+
+    def convolutions(self) -> list[nn.Conv2d]:
+        return [module for module in self.ways.modules() if isinstance(module, nn.Conv2d)]
+
+    def forward(self, *maps: Tensor) -> Tensor:
+        parts = (way(x) for way, x in zip(self.ways, maps, strict=True))
+        normed: Tensor = self.norm(functools.reduce(torch.add, parts))
+        return normed
+
+
+class Block(nn.Module):
+    """Normed convolutions, a ReLU after each; the first may see several maps."""
+
+    def __init__(self, first: Normed, *more: Normed) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList([first, *more])
+
+    def forward(self, *maps: Tensor) -> Tensor:
+        first, *more = self.layers
+        x = functional.relu(first(*maps))
+        for layer in more:
+            x = functional.relu(layer(x))
+        return x
+
+
+def convolution(inputs: int, outputs: int, size: int = 3, stride: int = 1, dilation: int = 1) -> nn.Conv2d:
+    """A map 1/stride as large; without a bias, for a batch norm follows."""
+    padding = dilation * (size - stride) // 2
+    return nn.Conv2d(inputs, outputs, size, stride, padding, dilation, bias=False)
+
+
+def plain_layers(*widths: int) -> list[Normed]:
+    """Convolutions of one map, from each width to the next."""
+    return [Normed(convolution(a, b)) for a, b in itertools.pairwise(widths)]
+
+
+class Enlarged(nn.Module):
+    """A convolution of a map, made twice as large after it: a quarter of the work, and no joint at the cells' edges."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.convolution = convolution(inputs, outputs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return functional.interpolate(self.convolution(x), scale_factor=2.0, mode="bilinear", align_corners=False)
+
+
+class Concatenated(Block):
+    """The paper's block of a decoder: the first map, a coarser one, at twice its size, concatenated with the rest."""
+
+    def forward(self, *maps: Tensor) -> Tensor:
+        coarse, *beside = maps
+        enlarged = functional.interpolate(coarse, scale_factor=2.0, mode="nearest")
+        return super().forward(torch.cat([enlarged, *beside], 1))
 
 
 class Surroundings(nn.Module):
@@ -139,65 +228,26 @@ class Surroundings(nn.Module):
 
     def __init__(self, width: int, dilation: int) -> None:
         super().__init__()
-        self.convolution = nn.Conv2d(width, width, 3, padding=dilation, dilation=dilation, bias=False)
-        self.norm: nn.Module = nn.BatchNorm2d(width)
-        nn.init.zeros_(self.norm.get_parameter("weight"))
+        self.change = Normed(convolution(width, width, dilation=dilation))
+        nn.init.zeros_(self.change.norm.get_parameter("weight"))
 
     def forward(self, x: Tensor) -> Tensor:
-        change: Tensor = self.norm(self.convolution(x))
-        return functional.relu(x + change)
-
-
-class Stem(nn.ModuleList):
-    """A first block: sees a picture in cells of 2x2, and beside it maps of half its size."""
-
-    def forward(self, image: Tensor, beside: Tensor) -> Tensor:
-        x = torch.cat([pixel_unshuffle(image) - GREY, beside], 1)
-        for layer in self:
-            x = layer(x)
-        return x
-
-
-class Joining(nn.ModuleList):
-    """A block of a decoder: sees the coarser map, of that many channels, at twice its size, and others beside it."""
-
-    def __init__(self, coarse: int, layers: Iterable[nn.Module]) -> None:
-        super().__init__(layers)
-        self.coarse = coarse
-
-    def forward(self, coarse: Tensor, beside: Features) -> Tensor:
-        x = torch.cat([functional.interpolate(coarse, scale_factor=2.0, mode="nearest"), *beside], 1)
-        for layer in self:
-            x = layer(x)
-        return x
+        return functional.relu(x + self.change(x))
 
 
 class UNet(nn.Module):
-    """Encoder and decoder with skips; ``joined`` are widths of maps added to the decoder's skips, finest first.
+    """Encoder and decoder with skips: blocks finest first, the encoder's one more than the decoder's.
 
-    ``dilations`` are those of the residual convolutions at the coarsest level. Who ``sees_picture`` takes that and maps
-    of half its size, else the first block takes one map.
+    A decoder's block sees the coarser map, the encoder's map of its size, and what is joined there. ``dilations`` are
+    those of the residual convolutions at the coarsest level, of that many channels.
     """
 
     def __init__(
-        self,
-        inputs: int,
-        widths: tuple[int, ...],
-        joined: tuple[int, ...] = (),
-        decoder_convolutions: int = 2,
-        dilations: tuple[int, ...] = (),
-        sees_picture: bool = False,
+        self, encoder: Iterable[Block], decoder: Iterable[Block], coarsest: int, dilations: tuple[int, ...] = ()
     ) -> None:
         super().__init__()
-        self.surroundings = nn.Sequential(*(Surroundings(widths[-1], d) for d in dilations))
-        first = conv_block(inputs, widths[0])
-        self.encoder = nn.ModuleList([Stem(first) if sees_picture else first])
-        self.encoder.extend(conv_block(a, b) for a, b in itertools.pairwise(widths))
-        extra = joined or (0,) * (len(widths) - 1)
-        self.decoder = nn.ModuleList(
-            Joining(widths[i + 1], conv_block(widths[i + 1] + widths[i] + extra[i], widths[i], decoder_convolutions))
-            for i in range(len(widths) - 1)
-        )
+        self.encoder, self.decoder = nn.ModuleList(encoder), nn.ModuleList(decoder)
+        self.surroundings = nn.Sequential(*(Surroundings(coarsest, d) for d in dilations))
 
     def forward(self, *inputs: Tensor, joined: Features = ()) -> Features:
         """The encoder's skips, finest first, and last the finest decoder map."""
@@ -208,8 +258,29 @@ class UNet(nn.Module):
             skips.append(x)
         x = self.surroundings(x)
         for i in reversed(range(len(self.decoder))):
-            x = self.decoder[i](x, (skips[i], *joined[i : i + 1]))
+            x = self.decoder[i](x, skips[i], *joined[i : i + 1])
         return (*skips[:-1], x)
+
+
+def _compact_unet(first: Normed, widths: tuple[int, ...], dilations: tuple[int, ...]) -> UNet:
+    """Ours: two convolutions a block, the first of all being given."""
+    encoder = [Block(first, *plain_layers(*widths[:1] * 2))]
+    encoder += [Block(*plain_layers(a, b, b)) for a, b in itertools.pairwise(widths)]
+    decoder = [
+        Block(Normed(Enlarged(coarse, own), convolution(own, own)), *plain_layers(own, own))
+        for own, coarse in itertools.pairwise(widths)
+    ]
+    return UNet(encoder, decoder, widths[-1], dilations)
+
+
+def _papers_unet(inputs: int, widths: tuple[int, ...], joined: tuple[int, ...]) -> UNet:
+    """The paper's: two convolutions a block on the way down, one on the way up; ``joined`` are widths of more skips."""
+    encoder = [Block(*plain_layers(a, b, b)) for a, b in itertools.pairwise((inputs, *widths))]
+    decoder = [
+        Concatenated(*plain_layers(coarse + own + more, own))
+        for (own, coarse), more in zip(itertools.pairwise(widths), joined, strict=True)
+    ]
+    return UNet(encoder, decoder, widths[-1])
 
 
 def _bounded_log_error(raw: Tensor) -> Tensor:
@@ -221,29 +292,26 @@ def _plane(values: Tensor, like: Tensor) -> Tensor:
     return values[:, None, None, None].expand(-1, 1, like.shape[2], like.shape[3])
 
 
-def pixel_unshuffle(image: Tensor) -> Tensor:
-    """[n,c,h,w] to [n,4c,h/2,w/2], written as slices, which every exporter and runtime takes."""
-    return torch.cat([image[:, :, i::2, j::2] for i in (0, 1) for j in (0, 1)], 1)
-
-
 class CompactBlur(nn.Module):
     """Ours: pixels and band energies at half size into a small U-Net; hands its last features on."""
 
-    WIDTHS = (24, 40, 64, 96)
+    WIDTHS = (16, 48, 64, 96)
     DILATIONS = (2, 4)
 
     def __init__(self) -> None:
         super().__init__()
         self.front = BandEnergy()
-        inputs = 12 + BandEnergy.OCTAVES * BandEnergy.BANDS
-        self.unet = UNet(inputs, self.WIDTHS, dilations=self.DILATIONS, sees_picture=True)
+        finest = self.WIDTHS[0]
+        image = convolution(3, finest, size=6, stride=2)
+        energies = convolution(BandEnergy.OCTAVES * BandEnergy.BANDS, finest)
+        self.unet = _compact_unet(Normed(image, energies), self.WIDTHS, self.DILATIONS)
         self.head = nn.Conv2d(self.WIDTHS[0], 2, 1)
         nn.init.constant_(self.head.get_parameter("bias")[0:1], math.log(2.0))
 
     def forward(self, image: Tensor) -> BlurEstimate:
         with torch.autocast(image.device.type, enabled=False):
             energies = self.front(image.float())
-        features = self.unet(image, energies)[-1]
+        features = self.unet(image - GREY, energies)[-1]
         with torch.autocast(image.device.type, enabled=False):
             out = functional.conv2d(features.float(), self.head.weight, self.head.bias)
         log_blur = out[:, :1].clamp(*(math.log(b) for b in BLUR_BOUNDS_PX))
@@ -257,13 +325,15 @@ class CompactDepth(nn.Module):
     near stays at or before the plane in focus and far behind it.
     """
 
-    WIDTHS = (16, 24, 32, 48)
+    WIDTHS = (16, 32, 32, 48)
     DILATIONS = (2, 4)
-    INPUTS = 8
+    PLANES = 8
 
     def __init__(self) -> None:
         super().__init__()
-        self.unet = UNet(CompactBlur.WIDTHS[0] + self.INPUTS, self.WIDTHS, dilations=self.DILATIONS)
+        finest = self.WIDTHS[0]
+        first = Normed(convolution(CompactBlur.WIDTHS[0], finest), convolution(self.PLANES, finest))
+        self.unet = _compact_unet(first, self.WIDTHS, self.DILATIONS)
         self.head = nn.Conv2d(self.WIDTHS[0], 5, 1)
         with torch.no_grad():
             self.head.weight.mul_(0.1)
@@ -278,10 +348,10 @@ class CompactDepth(nn.Module):
             planes = [torch.log(scene.focus_distance_m), focal, known, scene.side]
             inputs = [near, far, defocus.clamp(max=3.0), torch.log(spread.clamp(1e-3, 10.0)) * 0.3]
             inputs += [_plane(p, defocus) for p in planes]
-        x = self.unet(torch.cat([*features, *inputs], 1))[-1]
+        x = self.unet(*features, torch.cat(inputs, 1))[-1]
         with torch.autocast(defocus.device.type, enabled=False):
             out = functional.conv2d(x.float(), self.head.weight, self.head.bias)
-            free_near, free_far = -functional.softplus(out[:, 0:1]), functional.softplus(out[:, 1:2])
+            free_near, free_far = functional.logsigmoid(-out[:, 0:1]), -functional.logsigmoid(-out[:, 1:2])
             gate = torch.sigmoid(out[:, 2:3])
             log_near = (gate * near + (1 - gate) * free_near).clamp(-RATIO_BOUND, 0.0)
             log_far = (gate * far + (1 - gate) * free_far).clamp(0.0, RATIO_BOUND)
@@ -296,7 +366,7 @@ class PaperBlur(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.unet = UNet(3, self.WIDTHS, decoder_convolutions=1)
+        self.unet = _papers_unet(3, self.WIDTHS, (0,) * (len(self.WIDTHS) - 1))
         self.head = nn.Conv2d(self.WIDTHS[0], 1, 1)
 
     def forward(self, image: Tensor) -> BlurEstimate:
@@ -317,7 +387,7 @@ class PaperDepth(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.unet = UNet(2, self.WIDTHS, joined=self.WIDTHS[:-1], decoder_convolutions=1)
+        self.unet = _papers_unet(2, self.WIDTHS, self.WIDTHS[:-1])
         self.head = nn.Conv2d(self.WIDTHS[0], 1, 1)
 
     def forward(self, defocus: Tensor, _spread: Tensor, scene: Scene, features: Features) -> DepthEstimate:

@@ -1,8 +1,6 @@
 """The pair in int8: U8S8, per channel, with the front ends, the first and the last convolutions in float32.
 
-What is quantised is the pair as it was trained, norms folded: enlarging and joining cost next to nothing in int8, and
-``folded``'s sums of two convolutions would go back to float32 each. Weights have seven bits (``reduce_range``), because
-AVX2 without integer dot products adds pairs of products in sixteen.
+Weights have seven bits (``reduce_range``), because AVX2 without integer dot products adds pairs of products in sixteen.
 """
 
 import logging
@@ -25,7 +23,8 @@ from service.inference.artifact import GraphFile, Graphs, sha256_of
 
 SCENES = 48
 FIRST_SEED = 2**41  # neither a training's nor a held-out scene's
-QUANTISED = ("Conv", "Relu", "MaxPool", "Resize", "Concat", "Add")
+QUANTISED = ("Conv", "Relu", "MaxPool", "Resize", "Add")
+FIRST = "network.unet.encoder.0.layers.0."
 
 Feeds = dict[str, NDArray[np.float32]]
 
@@ -43,7 +42,7 @@ class _Feeds:
 def quantised_graphs(pair: Pair, folder: Path) -> Graphs:
     """Write both graphs in int8, their ranges taken from generated scenes; what the manifest says of them."""
     with tempfile.TemporaryDirectory() as scratch:
-        graphs = export_graphs(pair, Path(scratch), fold=False)
+        graphs = export_graphs(pair, Path(scratch))
         blur, depth = zip(*_scene_feeds(pair, graphs.feature_names), strict=True)
         return Graphs(
             blur=_quantised(graphs.blur, Path(scratch), list(blur), folder),
@@ -84,8 +83,9 @@ def _quantised(graph: GraphFile, scratch: Path, feeds: list[Feeds], folder: Path
 
 
 def _between_first_and_last(model: onnx.ModelProto) -> list[str]:
-    """Nodes after the first and before the last convolution of the network, whose weights have names."""
+    """Nodes after the first and before the last convolutions of the network; the first are of several maps."""
     nodes = list(model.graph.node)
-    learned = [i for i, node in enumerate(nodes) if node.op_type == "Conv" and node.input[1].startswith("network.")]
-    inner = nodes[learned[0] + 1 : learned[-1]]
+    kernels = {i: node.input[1] for i, node in enumerate(nodes) if node.op_type == "Conv"}
+    first = max(i for i, name in kernels.items() if name.startswith(FIRST))
+    inner = nodes[first + 1 : max(kernels)]
     return [node.name for node in inner if node.op_type in QUANTISED]

@@ -4,11 +4,12 @@ import copy
 
 import pytest
 import torch
+from torch.nn import functional
 
 from model_export.config import Kind, TrainConfig
 from model_export.folded import folded
 from model_export.losses import Batch, correct, run_pair, total_loss
-from model_export.networks import BandEnergy, Surroundings, make_pair, parameter_count
+from model_export.networks import LUMINANCE, BandEnergy, Surroundings, make_pair, parameter_count
 from model_export.render import blur
 
 KINDS: list[Kind] = ["compact", "paper"]
@@ -32,29 +33,36 @@ def test_both_pairs_answer_alike(kind: Kind) -> None:
     assert (seen.blur_px > 0).all()
 
 
-def test_folding_changes_no_answer_even_at_the_border() -> None:
-    pair = make_pair("compact")
+@pytest.mark.parametrize(
+    ("kind", "network", "channels_and_sizes"),
+    [
+        ("compact", "blur", ((3, 64), (12, 32))),
+        ("compact", "depth", ((16, 32), (8, 32))),
+        ("paper", "blur", ((3, 64),)),
+    ],
+)
+def test_folding_changes_no_answer_even_at_the_border(
+    kind: Kind, network: str, channels_and_sizes: tuple[tuple[int, int], ...]
+) -> None:
+    pair = make_pair(kind)
     for name, values in pair.modules().state_dict().items():
         if values.is_floating_point():  # batch norms' too, which start as the identity
             spread = torch.rand_like(values) * 0.4
             values.copy_(0.8 + spread if name.endswith("running_var") else values + spread - 0.2)
     pair.modules().eval().double()
-    other = folded(pair)
-    picture, maps, inputs = (torch.rand(1, c, s, s).double() for c, s in ((3, 64), (12, 32), (32, 32)))
-    for name, given in (("blur", (picture, maps)), ("depth", (inputs,))):
-        with torch.inference_mode():
-            expected, found = (one.modules().get_submodule(f"{name}.unet")(*given) for one in (pair, other))
-        for ours, theirs in zip(found, expected, strict=True):
-            torch.testing.assert_close(ours, theirs)
+    given = [torch.rand(1, channels, size, size).double() for channels, size in channels_and_sizes]
+    with torch.inference_mode():
+        expected, found = (one.modules().get_submodule(f"{network}.unet")(*given) for one in (pair, folded(pair)))
+    for ours, theirs in zip(found, expected, strict=True):
+        torch.testing.assert_close(ours, theirs)
 
 
-def test_folding_leaves_the_papers_pair_and_the_pair_in_training_alone() -> None:
-    paper, ours = make_pair("paper"), make_pair("compact")
-    before = copy.deepcopy(ours.modules().state_dict())
-    assert folded(paper) is paper
-    assert folded(ours).modules().state_dict().keys() != before.keys()
-    torch.testing.assert_close(ours.modules().state_dict(), before)
-    assert ours.blur.training
+def test_folding_leaves_no_norm_and_the_pair_in_training_alone() -> None:
+    pair = make_pair("compact")
+    before = copy.deepcopy(pair.modules().state_dict())
+    assert not [module for module in folded(pair).modules().modules() if isinstance(module, torch.nn.BatchNorm2d)]
+    torch.testing.assert_close(pair.modules().state_dict(), before)
+    assert pair.blur.training
 
 
 def test_the_papers_pair_has_its_size() -> None:
@@ -102,6 +110,23 @@ def test_band_energies_fall_with_blur_finest_first() -> None:
     lost = (front(sharp) - front(blur(sharp, 1.5))).mean((0, 2, 3))
     assert (lost[:8] > 0).all()
     assert lost[0] > lost[4] > lost[9]
+
+
+def test_the_finest_bands_in_cells_are_those_of_pixels() -> None:
+    picture = torch.rand(1, 3, 64, 96).double()
+    grey = (picture * torch.tensor(LUMINANCE)[None, :, None, None].double()).sum(1, keepdim=True)
+    once, twice = (gaussian_blurred(grey, BandEnergy.FIRST_SIGMA * 2 ** (i / BandEnergy.BANDS)) for i in (0, 1))
+    energy = gaussian_blurred((once - twice) ** 2, BandEnergy.SMOOTH_SIGMA)[..., ::2, ::2]
+    expected = torch.log(energy + BandEnergy.FLOOR) * 0.25 + 2
+    found = BandEnergy().double()(picture)[:, :1]
+    inner = (..., slice(8, -8), slice(8, -8))  # elsewhere the edge goes on, for the smoothing as for the picture
+    torch.testing.assert_close(found[inner], expected[inner], rtol=1e-4, atol=1e-5)
+
+
+def gaussian_blurred(maps: torch.Tensor, sigma: float) -> torch.Tensor:
+    taps = torch.exp(-0.5 * (torch.arange(-4, 5) / sigma) ** 2).double()
+    kernel = torch.outer(taps, taps)[None, None] / taps.sum() ** 2
+    return functional.conv2d(functional.pad(maps, (4,) * 4, mode="replicate"), kernel)
 
 
 def test_correction_takes_the_camera_out() -> None:
