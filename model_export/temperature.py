@@ -24,6 +24,7 @@ def temperature(pixels: Pixels) -> float:
 def calibrate(model: Path) -> Manifest:
     """Find the factor of a model folder and write it into its manifest, which is returned.
 
+    It is never below 1: photographs are stranger to a network than scenes of the kind it was trained on.
     The side is told: being on the wrong side of focus is what the other hypothesis is for. Raises ``ValueError`` for a
     model whose stated errors no factor in bounds makes honest.
     """
@@ -31,7 +32,7 @@ def calibrate(model: Path) -> Manifest:
     cases = [case for side in (-1, 1) for case in procedural_cases(SCENES, side, FIRST)]
     found = temperature(Pixels.joined([examiner.answer(case)[0].depth for case in cases]))
     before = load_model_folder(model).manifest
-    factor = round(before.temperature * found, DECIMALS)
+    factor = max(1.0, round(before.temperature * found, DECIMALS))
     calibrated = Manifest.model_validate(before.model_dump() | {"temperature": factor})
     write_manifest(model, calibrated)
     return calibrated

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -12,10 +13,11 @@ from typer.testing import CliRunner
 from model_export.cases import REFERENCE, Case, d200_cases, procedural_cases, shuffled_cases, viewed_cases
 from model_export.cli import commands
 from model_export.evaluate import EQUAL_BLUR_PX, Examiner, Pixels, Sides, blur_ranges, summarise
-from model_export.temperature import temperature
+from model_export.temperature import calibrate, temperature
+from service.inference.artifact import load_model_folder
 from service.optics import thin_lens
 from service.optics.camera import Camera
-from tests.inference.oracle_pair import LOG_DEPTH_SCALE, RELATIVE_BLUR_ERROR, blur_of
+from tests.inference.oracle_pair import LOG_DEPTH_SCALE, RELATIVE_BLUR_ERROR, blur_of, build_oracle_pair
 
 CAMERA = Camera(96, 64, 2.0, 6.0, 0.5)
 LEVEL = 90
@@ -110,6 +112,21 @@ def test_the_temperature_makes_intervals_hold_what_they_promise() -> None:
     told = np.full(20_000, 0.04, np.float32)
     pixels = Pixels((1 + 0.1 * rng.standard_normal(20_000)).astype(np.float32), np.ones_like(told), told)
     assert temperature(pixels) == pytest.approx(2.5, rel=0.05)
+
+
+def _told(found: float, _: Pixels) -> float:
+    return found
+
+
+def test_stated_errors_are_made_larger_by_what_is_found_but_never_smaller(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = build_oracle_pair(tmp_path / "model")
+    monkeypatch.setattr("model_export.temperature.SCENES", 1)
+    for found, factor in ((0.5, 1.0), (2.0, 2.0), (1.5, 3.0)):
+        monkeypatch.setattr("model_export.temperature.temperature", partial(_told, found))
+        assert calibrate(folder).temperature == factor
+        assert load_model_folder(folder).manifest.temperature == factor
 
 
 @pytest.mark.parametrize(("factor", "right", "either"), [(1.0, 0, 1), (1.05, 0, 1), (0.7, 0, 0)])
