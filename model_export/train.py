@@ -316,7 +316,8 @@ def train(
 ) -> Path:
     """Train in folder ``run``, going on from its checkpoint if there is one; the path of the last checkpoint.
 
-    A run without a checkpoint begins with the ``weights`` of a checkpoint or a model folder, or with random ones.
+    A run without a checkpoint begins with the ``weights`` of a checkpoint or a model folder, or with random ones. Torch
+    computes on the cores that ``workers`` leave, so other workers are another run by rounding.
     Raises ``ValueError`` for weights of another kind.
     """
     console = console or Console(stderr=True)

@@ -14,6 +14,7 @@ import torch
 from rich.console import Console
 
 from model_export.config import SceneConfig, TrainConfig
+from model_export.cores import torch_threads
 from model_export.folded import folded
 from model_export.losses import run_pair, total_loss
 from model_export.networks import make_pair
@@ -30,6 +31,7 @@ from model_export.train import (
     starting_pair,
     train,
 )
+from service.cores import available_cores
 
 SHIPPED = Path(__file__).parents[2] / "service" / "models"
 SCENES = SceneConfig(size_px=32, margin_px=8)
@@ -109,9 +111,10 @@ def test_a_stopped_run_goes_on_as_if_it_had_not_been_stopped(textures: Path, tmp
     halfway = Trainer(CONFIG, "cpu")
     pool = Pool(CONFIG, load_photographs(textures), 0, 0)
     list(pool.fill())
-    for step in range(3):
-        halfway.advance(pool.batch(step))
-        pool.refresh(step)
+    with torch_threads(available_cores()):  # as without workers: other threads round otherwise
+        for step in range(3):
+            halfway.advance(pool.batch(step))
+            pool.refresh(step)
     halfway.checkpoint().save(tmp_path / "stopped" / "checkpoint.pt")
     resumed, _ = run(CONFIG, textures, tmp_path / "stopped")
     for name, weight in whole.modules.items():

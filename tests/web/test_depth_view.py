@@ -238,7 +238,8 @@ def test_colours_are_those_of_the_metres(measured: Page, maps: Callable[..., Any
     def is_painted() -> bool:
         x, y, *colours = np.array(measured.locator("[data-picture=depth]").evaluate(PICTURE_COLOURS)).T
         expected = grey[(y * 432).astype(int), (x * 645).astype(int)]
-        return all(np.abs(colour - expected).max() <= 1 for colour in colours)
+        answered = np.isfinite(expected)
+        return answered.mean() > 0.9 and all(np.abs(colour - expected)[answered].max() <= 1 for colour in colours)
 
     eventually(measured, is_painted)
     expect(measured.locator(".depth-ticks")).to_contain_text("2")
