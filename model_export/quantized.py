@@ -15,7 +15,7 @@ from onnxruntime.quantization import QuantFormat, QuantType, quantize_static
 from onnxruntime.quantization.shape_inference import quant_pre_process
 
 from model_export.config import SceneConfig
-from model_export.export import export_graphs
+from model_export.export import export_graphs, finish
 from model_export.networks import Pair
 from model_export.scenes import draw_sample
 from model_export.verify import CAMERA, through_torch
@@ -78,7 +78,7 @@ def _quantised(graph: GraphFile, scratch: Path, feeds: list[Feeds], folder: Path
         )
     finally:
         logging.root.setLevel(level)
-    onnx.checker.check_model(onnx.load(folder / graph.file), full_check=True)
+    finish(folder / graph.file)
     return graph.model_copy(update={"sha256": sha256_of(folder / graph.file)})
 
 

@@ -12,6 +12,7 @@ from model_export.config import Kind, TrainConfig
 from model_export.export import export_pair
 from model_export.networks import Pair, make_pair
 from model_export.verify import SIZES, TOLERANCE, verify_pair
+from service.config import INT8, SHIPPED_MODEL
 from service.inference.artifact import load_model_folder
 
 INT8_TOLERANCE = 0.05
@@ -78,6 +79,17 @@ def test_the_folder_is_whole_and_small(exported: tuple[Pair, Path]) -> None:
     assert manifest.stride == pair.stride
     assert manifest.training.config["kind"] == pair.kind
     assert sum(f.stat().st_size for f in folder.iterdir()) < 16_000_000
+
+
+@pytest.mark.parametrize("shipped", [SHIPPED_MODEL, SHIPPED_MODEL / INT8], ids=["shipped", "shipped-int8"])
+def test_graphs_name_no_file_of_the_machine_that_made_them(
+    exported: tuple[Pair, Path], in_int8: tuple[Pair, Path], shipped: Path
+) -> None:
+    for folder in (exported[1], in_int8[1], shipped):
+        for graph in folder.glob("*.onnx"):
+            content = graph.read_bytes()
+            assert b'File "' not in content
+            assert str(Path(quantized.__file__).parents[1]).encode() not in content
 
 
 def test_the_card_carries_ranges_licences_and_then_scores(exported: tuple[Pair, Path]) -> None:
