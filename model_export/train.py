@@ -103,6 +103,10 @@ class Pool:
         rng = np.random.default_rng((self.config.seed, step))
         return collate([self.samples[i] for i in rng.integers(0, len(self.samples), self.config.batch)], rng)
 
+    def settling(self) -> Iterator[Batch]:
+        """Batches of the pool as it is that no step draws, for batch norms to settle on."""
+        return (self.batch(self.config.steps + i) for i in range(self.config.settle_batches))
+
     def refresh(self, step: int) -> None:
         """Let in the new scenes that come after this step; as many old ones go."""
         for _ in range(self._drawn(step), self._drawn(step + 1)):
@@ -336,29 +340,28 @@ def train(
             pass
         if start is not None and weights is not None:
             if weights.is_dir():
-                batches = (pool.batch(config.steps + i) for i in range(config.settle_batches))
-                spread_norms(start, (partial(run_pair, start, batch) for batch in batches))
+                spread_norms(start, (partial(run_pair, start, batch) for batch in pool.settling()))
             trainer.begin_with(start)
         task = progress.add_task("training", total=config.steps, completed=trainer.step)
-        recent: deque[dict[str, float]] = deque(maxlen=config.checkpoint_every)
+        recent: list[dict[str, float]] = []
         pace = Pace()
         while trainer.step < config.steps:
             if trainer.step == settling_step(config):
-                trainer.settle(pool.batch(config.steps + i) for i in range(config.settle_batches))
+                trainer.settle(pool.settling())
             recent.append(trainer.advance(pool.batch(trainer.step)))
             with pace.waiting():
                 pool.refresh(trainer.step - 1)
             progress.update(task, completed=trainer.step)
             if trainer.step % config.checkpoint_every == 0 or trainer.step == config.steps:
                 trainer.checkpoint().save(path)
-                spent = pace.told(len(recent), config.fresh_per_step)
-                console.print(f"{_report(trainer.step, recent, trainer.validate(test))}  {spent}")
-                recent.clear()
-                pace = Pace()
+                console.print(_report(trainer, recent, test, pace))
+                recent, pace = [], Pace()
     return path
 
 
-def _report(step: int, recent: deque[dict[str, float]], test: dict[str, float]) -> str:
-    mean = {name: sum(parts[name] for parts in recent) / len(recent) for name in test}
-    figures = "  ".join(f"{name} {mean[name]:.3f} (held out {test[name]:.3f})" for name in test)
-    return f"step {step}: {figures}"
+def _report(trainer: Trainer, recent: list[dict[str, float]], test: Batch, pace: Pace) -> str:
+    """A line on the recent steps: their losses beside those on held-out scenes, and how fast they went."""
+    held_out_parts = trainer.validate(test)
+    mean = {name: sum(parts[name] for parts in recent) / len(recent) for name in held_out_parts}
+    figures = "  ".join(f"{name} {mean[name]:.3f} (held out {held_out_parts[name]:.3f})" for name in mean)
+    return f"step {trainer.step}: {figures}  {pace.told(len(recent), trainer.config.fresh_per_step)}"
