@@ -66,7 +66,7 @@ audit: setup ## Look the locked dependencies up among known vulnerabilities; fai
 	$(BIN)/python requirements/audit.py --strict
 
 lock: setup ## Write requirements/ and package-lock.json, pins kept; LOCK_FLAGS=--upgrade takes the newest
-	@echo 'pip>=25.3' | $(LOCK) --output-file requirements/service.txt --extra postgres --extra otel pyproject.toml -
+	@echo 'pip>=25.3' | $(LOCK) --output-file requirements/service.txt --extra postgres --extra otel --extra heic --extra raw pyproject.toml -
 	@echo torch | $(LOCK) --output-file requirements/dev.txt --constraint requirements/service.txt --excludes /dev/stdin \
 		--extra postgres --extra otel --extra heic --extra raw --extra train --group dev pyproject.toml
 	@printf 'hatchling>=1.27,<2\neditables\n' | $(LOCK) --output-file requirements/build.txt -
