@@ -24,7 +24,7 @@ from service.optics.camera import Camera, Intrinsics, Lens
 FRAME_FX_PX = 525.0
 UNSEEN_K_CAM_PX = (2.64, 3.81, 6.80, 10.7)
 FAR_K_CAM_PX = (1.0, 20.0, 60.0)
-LARGE_K_CAM_PX, LARGE_TIMES = 60.0, 4  # such a k_cam belongs to a photograph of many pixels
+LARGE_K_CAMS_PX = {60.0: 4, 9.0: 3}  # such a k_cam belongs to a photograph of many pixels: so many times a frame's
 FOCUS_DISTANCES_M = (0.6, 1.0, 4.0)
 PLANES_M = (0.7, 1.0, 1.5)
 VIEWS = (0.6, 0.8, 1.5)
@@ -269,10 +269,10 @@ def _indoor_trials(folder: Path, quick: bool) -> list[Trial]:
         return found
     for k_cam_px in FAR_K_CAM_PX:
         found += [_trial(f"{folder.name} k_cam {k_cam_px:g}", by(replace(REFERENCE, k_cam_px=k_cam_px), few))]
-    small = replace(REFERENCE, k_cam_px=LARGE_K_CAM_PX / LARGE_TIMES)
-    large = f"{REFERENCE.image_width_px * LARGE_TIMES}x{REFERENCE.image_height_px * LARGE_TIMES}"
-    enlarged = partial(enlarged_cases, folder, few, small, LARGE_TIMES)
-    found += [_trial(f"{folder.name} k_cam {LARGE_K_CAM_PX:g} of {large}", enlarged)]
+    for k_cam_px, times in LARGE_K_CAMS_PX.items():
+        enlarged = partial(enlarged_cases, folder, few, replace(REFERENCE, k_cam_px=k_cam_px / times), times)
+        large = f"{REFERENCE.image_width_px * times}x{REFERENCE.image_height_px * times}"
+        found += [_trial(f"{folder.name} k_cam {k_cam_px:g} of {large}", enlarged)]
     for focus_m in FOCUS_DISTANCES_M:
         camera = replace(REFERENCE, focus_distance_m=focus_m)
         found.append(_trial(f"{folder.name} focus {focus_m:g} m", by(camera, few, "auto")))

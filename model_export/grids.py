@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from model_export.render import DISC, GAUSSIAN, PIXEL_BOX_VARIANCE, PointSpread, blur_varying
+from model_export.render import DISC, GAUSSIAN, PointSpread, blur_varying
 from service.calibration.target import CircleGrid
 from service.optics import thin_lens
 from service.optics.camera import Intrinsics
@@ -167,7 +167,7 @@ def _printed(pose: GridPose, grid: CircleGrid, places_mm: Array, gamma_px: float
 
 def _edge(away_px: Array, gamma_px: float) -> Array:
     """How much of a pixel [...] at a signed distance from a straight edge is inside, after a Gaussian blur."""
-    sigma = math.sqrt(max(gamma_px**2 - PIXEL_BOX_VARIANCE, 1e-4))
+    sigma = math.sqrt(max(gamma_px**2 - thin_lens.PIXEL_BOX_VARIANCE, 1e-4))
 
     def total(to: Array) -> Array:
         t = to / sigma

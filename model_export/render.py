@@ -24,7 +24,6 @@ from service.optics.light import decode_srgb, encode_srgb
 LEVEL_RATIO = 1.25
 LEVEL_OFFSET_PX = 0.5
 MARGIN_SIGMAS = 3.0
-PIXEL_BOX_VARIANCE = 1.0 / 12.0
 SOFT_EDGE_VARIANCE = 0.25
 SAMPLED_BELOW_VARIANCE = 0.8
 SAMPLED_TAPS = 8
@@ -233,7 +232,7 @@ def refocus(
             out = blur(rgba.permute(2, 0, 1), level, spread)
             yield out[:3], out[3:]
 
-    rest = math.sqrt(max(camera.gamma_px**2 - PIXEL_BOX_VARIANCE, 0.0))
+    rest = math.sqrt(max(camera.gamma_px**2 - thin_lens.PIXEL_BOX_VARIANCE, 0.0))
     picture = blur(composite(blurred()), rest)
     inner = picture[:, margin : margin + height, margin : margin + width]
     return encode_srgb(inner.permute(1, 2, 0).numpy())

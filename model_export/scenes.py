@@ -14,13 +14,13 @@ import torch
 from numpy.typing import NDArray
 
 from model_export.config import SceneConfig
-from model_export.render import PIXEL_BOX_VARIANCE, Layer, PointSpread, blur, render_layers
+from model_export.render import Layer, PointSpread, blur, render_layers
 from model_export.rooms import Surface, draw_room
 from model_export.textures import draw_texture
 from service.optics import thin_lens
 from service.optics.light import decode_srgb, encode_srgb
 
-BOTH_SIDES_SHARE = 0.4
+BOTH_SIDES_SHARE = 0.65  # something before and something beyond what is in focus, as in most photographs
 # what people photograph is a few metres away: the background of a close-up is beyond its focus, and what a distant
 # focus shows is mostly nearer
 USUAL_DEPTH_M, DEPTH_SPREAD = 2.0, 0.8  # median, and standard deviation of the logarithm
@@ -33,7 +33,7 @@ NEAREST_AT_MOST, FARTHEST_AT_LEAST = 0.5, 2.0
 CLOSE_SHARE = 0.5
 FOCUSED_SHARE = 0.2  # somebody focused on something: sharp is read as blurred by who seldom saw it
 K_CAM_LEAN = 0.5  # so that every octave of blur has about its share: what is rare is read as what is common
-DISC_SHARE, GAUSSIAN_SHARE = 0.4, 0.3  # opened-up lenses have discs, soft ones come near a bell
+DISC_SHARE, GAUSSIAN_SHARE = 0.6, 0.12  # lenses have discs, softened where they are soft; few come near a bell
 ROUND_SHARE = 0.7
 CHROMATIC_SHARE = 0.4
 CHROMATIC_PX = 0.8
@@ -108,7 +108,7 @@ def _draw_spread(rng: np.random.Generator, k_cam_px: float) -> PointSpread:
     plane in focus, sharper beyond it.
     """
     shape = rng.random()
-    disc_share = 0.0 if shape < GAUSSIAN_SHARE else 1.0 if shape > 1 - DISC_SHARE else rng.uniform(0.3, 1.0)
+    disc_share = 0.0 if shape < GAUSSIAN_SHARE else 1.0 if shape > 1 - DISC_SHARE else rng.uniform(0.4, 1.0)
     squeeze = 1.0 if rng.random() < ROUND_SHARE else rng.uniform(0.7, 1.0)
     shift = min(CHROMATIC_PX, CHROMATIC_PART * k_cam_px) if rng.random() < CHROMATIC_SHARE else 0.0
     most = 0.0 if rng.random() < ACHROMAT_SHARE else shift
@@ -282,11 +282,10 @@ def draw_sample(seed: int, config: SceneConfig, photographs: list[NDArray[np.uin
         defocus_px=(config.defocus_px[0] * ratio, config.defocus_px[1] * ratio),
     )
     # a pixel of the small picture averages those of the large one: its box is there before it is made small
-    rest = max(shot.gamma_px**2 - PIXEL_BOX_VARIANCE, 0.0)
     taken = replace(
         shot,
         k_cam_px=shot.k_cam_px * ratio,
-        gamma_px=math.sqrt(rest * ratio**2 + PIXEL_BOX_VARIANCE),
+        gamma_px=thin_lens.gamma_after_averaging(shot.gamma_px, ratio),
         focal_length_px=shot.focal_length_px * ratio,
     )
     image, excess = _photograph(rng, taken, larger, photographs)
@@ -303,7 +302,7 @@ def _photograph(
     layers, excesses = draw_layers(rng, shot, config, photographs)
     linear, front = render_layers(layers, shot.spread)
     seen = np.take_along_axis(excesses, front.numpy()[None], 0)[0]
-    variance = shot.gamma_px**2 - PIXEL_BOX_VARIANCE
+    variance = shot.gamma_px**2 - thin_lens.PIXEL_BOX_VARIANCE
     through_mosaic = variance > MOSAIC_VARIANCE and rng.random() < MOSAIC_SHARE
     rest = math.sqrt(max(variance - through_mosaic * MOSAIC_VARIANCE, 0.0))
     inner = slice(config.margin_px, config.margin_px + config.size_px)

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from model_export.render import DISC, PIXEL_BOX_VARIANCE, blur
+from model_export.render import DISC, blur
 from service.optics import thin_lens
 from service.optics.light import encode_srgb
 
@@ -191,7 +191,7 @@ def develop(rendered: Path, scenes: list[Scene], out: Path) -> None:
         light = torch.from_numpy(found["light"].transpose(2, 0, 1).copy())
         margin = 8
         padded = torch.nn.functional.pad(light[None], (margin,) * 4, mode="reflect")[0]
-        soft = blur(padded, math.sqrt(GAMMA_PX**2 - PIXEL_BOX_VARIANCE))[:, margin:-margin, margin:-margin]
+        soft = blur(padded, math.sqrt(GAMMA_PX**2 - thin_lens.PIXEL_BOX_VARIANCE))[:, margin:-margin, margin:-margin]
         picture = encode_srgb((soft / soft.quantile(0.98).clamp_min(1e-3)).permute(1, 2, 0).numpy())
         depth_mm = np.where(found["depth_m"] < 65, found["depth_m"] * MILLIMETRES, 0)
         cv2.imwrite(str(out / "color" / f"{scene.name}.png"), np.rint(picture[:, :, ::-1] * 255).astype(np.uint8))

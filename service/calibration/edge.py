@@ -18,6 +18,8 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.optimize import least_squares, minimize_scalar
 from scipy.special import chndtr, ndtr
 
+from service.optics import thin_lens
+
 Shape = Literal["gaussian", "disc"]
 Array = NDArray[np.float64]
 
@@ -33,7 +35,7 @@ MOST_STRETCH = 2.5
 MOST_SHIFT, OTHER_SIZE = 0.5, 1.6
 PROFILE_POINTS = 256
 BOX_SHOWS_BELOW_PX = 1.2  # a wider blur is as good as a Gaussian of its own width
-PIXEL_BOX_VARIANCE, LEAST_REST_PX = 1 / 12, 0.1
+LEAST_REST_PX = 0.1
 PIXEL_BOX = ((-math.sqrt(0.15), 5 / 18), (0.0, 8 / 18), (math.sqrt(0.15), 5 / 18))  # the mean over a pixel by Gauss
 MOST_PIXELS = 2500
 ALIKE_BELOW_PX = 0.9
@@ -312,7 +314,7 @@ def _profile(at: Array, radius: float, blur_px: float, spread: Spread) -> Array:
     if spread.shape == "gaussian" or rim > ALL_RIM * blur_px:
         if blur_px > BOX_SHOWS_BELOW_PX:
             return _gaussian_profile(at, radius, blur_px)
-        rest_px = math.sqrt(max(blur_px**2 - PIXEL_BOX_VARIANCE, LEAST_REST_PX**2))
+        rest_px = math.sqrt(max(blur_px**2 - thin_lens.PIXEL_BOX_VARIANCE, LEAST_REST_PX**2))
         parts = [weight * _gaussian_profile(at + place, radius, rest_px) for place, weight in PIXEL_BOX]
         return np.asarray(sum(parts))
     hard = _disc_profile(at, radius, 2 * math.sqrt(blur_px**2 - rim**2))

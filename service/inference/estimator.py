@@ -18,6 +18,8 @@ from service.optics.camera import Camera
 # by a k_cam of 10.7 px, RMSE at full size and on the copy where it is 8: indoor frames 0.174 and 0.181 m, table tops
 # 0.163 and 0.115 m
 WELL_READ_K_CAM_PX = 8.0
+# of a picture larger than this the network sees too little at a time, and reads it as well where k_cam is this:
+WIDE_PX, FINE_K_CAM_PX = 640, 5.0
 HIGH_BLUR = 0.8
 HIGH_BLUR_FRACTION = 0.02
 SECOND_SCALE = 1 / 3
@@ -73,13 +75,19 @@ class Estimator:
         if (width, height) != (camera.image_width_px, camera.image_height_px):
             raise ValueError(f"the camera must be that of a {width}x{height} image: resize it first")
         cancellation = cancellation or Cancellation()
-        if part is not None:
-            margin_px = round(OVERLAP_PX / self._base_scale(camera))
-            around = part.widened(margin_px, self.manifest.multiple, width, height)
-            read = self.estimate(around.of(rgb), around.behind(camera), side, cancellation)
-            return read.cut(part.within(around))
+        scale = self._base_scale(camera)
+        if part is None:
+            return self._estimate(rgb, camera, scale, side, cancellation)
+        around = part.widened(round(OVERLAP_PX / scale), self.manifest.multiple, width, height)
+        read = self._estimate(around.of(rgb), around.behind(camera), scale, side, cancellation)
+        return read.cut(part.within(around))
+
+    def _estimate(
+        self, rgb: NDArray[np.uint8], camera: Camera, scale: float, side: Side, cancellation: Cancellation
+    ) -> DepthMap:
+        height, width = rgb.shape[:2]
         stopwatch = Stopwatch()
-        readings = [self._read(rgb, camera, self._base_scale(camera), side, cancellation, stopwatch)]
+        readings = [self._read(rgb, camera, scale, side, cancellation, stopwatch)]
         second = self._second_scale(readings[0])
         if second is not None:
             readings.append(self._read(rgb, camera, second, side, cancellation, stopwatch))
@@ -106,8 +114,10 @@ class Estimator:
         self._freeing.start()
 
     def _base_scale(self, camera: Camera) -> float:
-        """The largest copy whose k_cam the model reads well; never an enlarged one."""
-        return min(1.0, min(WELL_READ_K_CAM_PX, self.manifest.ranges.k_cam_px.high) / camera.k_cam_px)
+        """The largest copy whose k_cam the model reads well, or a smaller one of a large picture; never enlarged."""
+        at_most = min(WELL_READ_K_CAM_PX, self.manifest.ranges.k_cam_px.high) / camera.k_cam_px
+        longer_px = max(camera.image_width_px, camera.image_height_px)
+        return min(1.0, at_most, max(WIDE_PX / longer_px, FINE_K_CAM_PX / camera.k_cam_px))
 
     def _second_scale(self, first: Reading) -> float | None:
         """A smaller copy, where the first shows more blur than the model reads well; None without need."""
@@ -126,7 +136,7 @@ class Estimator:
         cancellation: Cancellation,
         stopwatch: Stopwatch,
     ) -> Reading:
-        working = camera.resized(
+        working = camera.averaged(
             max(1, round(camera.image_width_px * scale)), max(1, round(camera.image_height_px * scale))
         )
         size = (working.image_width_px, working.image_height_px)

@@ -141,6 +141,13 @@ class Camera:
             intrinsics=scaled,
         )
 
+    def averaged(self, width_px: int, height_px: int) -> "Camera":
+        """The camera behind a copy made smaller by averaging areas, whose gamma has a pixel's box again."""
+        if (width_px, height_px) == (self.image_width_px, self.image_height_px):
+            return self
+        gamma_px = thin_lens.gamma_after_averaging(self.gamma_px, width_px / self.image_width_px)
+        return replace(self.resized(width_px, height_px), gamma_px=gamma_px)
+
     def cropped(self, left_px: int, top_px: int, width_px: int, height_px: int) -> "Camera":
         """The camera behind a part of its picture: only the principal point moves."""
         known = self.intrinsics

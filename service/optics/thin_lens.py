@@ -22,6 +22,7 @@ class Arithmetic(Protocol):
 
 
 Q = TypeVar("Q", bound=Arithmetic)
+PIXEL_BOX_VARIANCE = 1 / 12  # of a box one pixel wide, per axis, px^2
 
 
 def k_cam(
@@ -66,6 +67,15 @@ def blur_from_defocus(defocus_px: Q, gamma_px: Q | float) -> Q:
     """lambda = sqrt(sigma^2 + gamma^2) in pixels: what the image shows (eq. 5)."""
     blur: Q = (defocus_px * defocus_px + gamma_px * gamma_px) ** 0.5
     return blur
+
+
+def gamma_after_averaging(gamma_px: float, ratio: float) -> float:
+    """gamma in pixels of the copy ``ratio`` times as large, where the smaller of both averages areas of the larger.
+
+    gamma contains a pixel's box, which is a pixel wide in either; the rest of it scales.
+    """
+    rest = max(gamma_px**2 - PIXEL_BOX_VARIANCE, 0.0)
+    return float((rest * ratio**2 + PIXEL_BOX_VARIANCE) ** 0.5)
 
 
 def blur_at_depth(depth_m: Q, focus_distance_m: Q | float, k_cam_px: Q | float, gamma_px: Q | float) -> Q:

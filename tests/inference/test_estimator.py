@@ -127,11 +127,25 @@ def test_a_large_k_cam_is_read_on_a_smaller_copy_and_reported(estimator: Estimat
     answer = estimator.estimate(grey(100, 400, 600), camera, "near")
     assert answer.scales == (0.25,)
     working_blur = blur_of(100)
-    x = thin_lens.relative_defocus_from_blur(working_blur, 0.125, 8.0)
+    x = thin_lens.relative_defocus_from_blur(working_blur, camera.averaged(150, 100).gamma_px, 8.0)
     np.testing.assert_allclose(answer.depth_m, thin_lens.depth_near(x, 2.0), rtol=1e-4)
     np.testing.assert_allclose(answer.blur_px, working_blur * 4, rtol=1e-4)
     assert "read at 0.25 of full size (150x100)" in answer.warnings
     assert answer.camera is camera
+
+
+@pytest.mark.parametrize(
+    ("width_px", "k_cam_px", "scale"),
+    [(640, 7.5, 1.0), (1600, 7.5, 5 / 7.5), (1600, 20.0, 0.4), (1600, 1.3, 1.0), (1280, 32.0, 0.25)],
+)
+def test_of_a_large_picture_a_copy_is_read_that_shows_much_at_a_time_and_enough_blur(
+    estimator: Estimator, width_px: int, k_cam_px: float, scale: float
+) -> None:
+    picture = grey(40, width_px // 4, width_px)
+    camera = Camera(width_px, width_px // 4, 2.0, k_cam_px)
+    assert estimator.estimate(picture, camera, "near").scales == pytest.approx((scale,), rel=0.01)
+    part = estimator.estimate(picture, camera, "near", part=Part(0, 0, 40, 40))
+    assert part.scales == pytest.approx((scale,), rel=0.05)
 
 
 def test_a_small_copy_keeps_the_place_of_things(estimator: Estimator) -> None:
@@ -203,7 +217,7 @@ def test_two_threads_get_the_answer_of_one(estimator: Estimator) -> None:
 def test_a_part_is_read_with_its_surroundings_and_no_more(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     estimator = Estimator.from_folder(load_model_folder(folder))
     rgb = np.random.default_rng(0).integers(40, 130, (900, 1200, 3), np.uint8)
-    camera = Camera(1200, 900, 2.0, 6.0, 0.5)
+    camera = Camera(1200, 900, 2.0, 4.0, 0.5)
     whole, part = estimator.estimate(rgb, camera, "near"), Part(500, 400, 560, 430)
     seen: list[tuple[int, ...]] = []
     see = GraphPair.see

@@ -3,8 +3,10 @@
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 
+from service.optics import thin_lens
 from service.optics.camera import Camera, Intrinsics, Lens
 
 D200 = Lens(focal_length_mm=35, f_number=2.8, pixel_pitch_um=6.05, sensor_width_px=3872)
@@ -52,6 +54,22 @@ def test_resizing_there_and_back_is_nothing() -> None:
     assert back.intrinsics is not None
     assert back.intrinsics.cx_px == pytest.approx(319.5)
     assert back.intrinsics.distortion == (0.1, -0.2)
+
+
+@pytest.mark.parametrize("times", [2, 5])
+def test_averaging_areas_leaves_the_rest_of_gamma_and_a_box(times: int) -> None:
+    taps, per_pixel = np.array([0.1, 0.2, 0.4, 0.2, 0.1]), 20
+    rest = float((taps * np.arange(-2, 3) ** 2).sum())
+    points = (np.arange(times * per_pixel) + 0.5) / per_pixel + 5 * times  # all over one pixel of the copy
+    squares = np.zeros(len(points))
+    for offset, tap in zip(range(-2, 3), taps, strict=True):
+        copied = np.floor((np.floor(points) + offset) / times)
+        squares += tap * ((copied + 0.5) - points / times) ** 2
+    large = camera(gamma_px=math.sqrt(rest + thin_lens.PIXEL_BOX_VARIANCE))
+    small = large.averaged(640 // times, 480 // times)
+    assert small.gamma_px**2 == pytest.approx(squares.mean(), rel=1e-3)
+    assert small.k_cam_px == pytest.approx(3.81 / times)
+    assert large.averaged(640, 480) is large
 
 
 def test_the_centre_of_the_image_stays_its_centre() -> None:
