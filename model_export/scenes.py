@@ -20,7 +20,7 @@ from model_export.textures import draw_texture
 from service.optics import thin_lens
 from service.optics.light import decode_srgb, encode_srgb
 
-BOTH_SIDES_SHARE = 0.65  # something before and something beyond what is in focus, as in most photographs
+BOTH_SIDES_SHARE = 0.4
 # what people photograph is a few metres away: the background of a close-up is beyond its focus, and what a distant
 # focus shows is mostly nearer
 USUAL_DEPTH_M, DEPTH_SPREAD = 2.0, 0.8  # median, and standard deviation of the logarithm
@@ -33,7 +33,7 @@ NEAREST_AT_MOST, FARTHEST_AT_LEAST = 0.5, 2.0
 CLOSE_SHARE = 0.5
 FOCUSED_SHARE = 0.2  # somebody focused on something: sharp is read as blurred by who seldom saw it
 K_CAM_LEAN = 0.5  # so that every octave of blur has about its share: what is rare is read as what is common
-DISC_SHARE, GAUSSIAN_SHARE = 0.6, 0.12  # lenses have discs, softened where they are soft; few come near a bell
+DISC_SHARE, GAUSSIAN_SHARE = 0.4, 0.3  # opened-up lenses have discs, soft ones come near a bell
 ROUND_SHARE = 0.7
 CHROMATIC_SHARE = 0.4
 CHROMATIC_PX = 0.8
@@ -108,7 +108,7 @@ def _draw_spread(rng: np.random.Generator, k_cam_px: float) -> PointSpread:
     plane in focus, sharper beyond it.
     """
     shape = rng.random()
-    disc_share = 0.0 if shape < GAUSSIAN_SHARE else 1.0 if shape > 1 - DISC_SHARE else rng.uniform(0.4, 1.0)
+    disc_share = 0.0 if shape < GAUSSIAN_SHARE else 1.0 if shape > 1 - DISC_SHARE else rng.uniform(0.3, 1.0)
     squeeze = 1.0 if rng.random() < ROUND_SHARE else rng.uniform(0.7, 1.0)
     shift = min(CHROMATIC_PX, CHROMATIC_PART * k_cam_px) if rng.random() < CHROMATIC_SHARE else 0.0
     most = 0.0 if rng.random() < ACHROMAT_SHARE else shift
