@@ -155,6 +155,12 @@ export function CameraForm({ editing, onSaved, onCancel }) {
           ${field("description", "Description", { kind: "text" })}
         </div>
       </details>
+      ${base?.source === "calibration" &&
+      html`<p class="hint">Saved by hand it counts as given; what was calibrated stays as revision ${base.revision}.</p>`}
+      <div class="row">
+        <button class="primary" disabled=${isSaving}>${base ? "Save as a new revision" : "Create camera"}</button>
+        <button type="button" onClick=${onCancel}>Cancel</button>
+      </div>
       <section class="stack live" aria-label="What these numbers come to" aria-live="polite">
         ${preview
           ? html`<${CameraCurve} camera=${preview} points=${preview.points} />`
@@ -164,12 +170,6 @@ export function CameraForm({ editing, onSaved, onCancel }) {
                 : (faults[0]?.detail ?? "Working it out ...")}
             </p>`}
       </section>
-      ${base?.source === "calibration" &&
-      html`<p class="hint">Saved by hand it counts as given; what was calibrated stays as revision ${base.revision}.</p>`}
-      <div class="row">
-        <button class="primary" disabled=${isSaving}>${base ? "Save as a new revision" : "Create camera"}</button>
-        <button type="button" onClick=${onCancel}>Cancel</button>
-      </div>
     </form>
   `;
 }

@@ -155,6 +155,13 @@ function CameraCard({ camera, go, onEdit, onDeleted, onStale }) {
         </span>
       </div>
       ${camera.description && html`<p>${camera.description}</p>`}
+      <div class="row">
+        <button type="button" class="primary" onClick=${() => go("depth", { camera: camera.name })}>Measure depth</button>
+        <button type="button" onClick=${onEdit}>Edit</button>
+        <button type="button" onClick=${() => go("calibrate", { camera: camera.name })}>Calibrate</button>
+        <button type="button" onClick=${() => exportCameras([camera], camera.name)}>Export</button>
+        <button type="button" class="danger" onClick=${() => setIsDeleting(true)}>Delete</button>
+      </div>
       <${CameraCurve} camera=${camera} points=${curve?.points ?? null} />
       <${ProblemBox} problem=${problem} />
       <dl class="facts">
@@ -173,13 +180,6 @@ function CameraCard({ camera, go, onEdit, onDeleted, onStale }) {
           </dd>`}
         <dt>Changed</dt><dd>${when(camera.updated_at)}</dd>
       </dl>
-      <div class="row">
-        <button type="button" class="primary" onClick=${() => go("depth", { camera: camera.name })}>Measure depth</button>
-        <button type="button" onClick=${onEdit}>Edit</button>
-        <button type="button" onClick=${() => go("calibrate", { camera: camera.name })}>Calibrate</button>
-        <button type="button" onClick=${() => exportCameras([camera], camera.name)}>Export</button>
-        <button type="button" class="danger" onClick=${() => setIsDeleting(true)}>Delete</button>
-      </div>
       <${Revisions} path=${`${path}/revisions`} />
       ${isDeleting && html`<${DeleteDialog} camera=${camera} path=${path} onClose=${() => setIsDeleting(false)} ...${{ onDeleted, onStale }} />`}
     </article>

@@ -8,7 +8,7 @@ from typing import Any
 from uuid import uuid4
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Route, expect
 
 from model_export.served import Server
 from tests.web.steps import OVERFLOW
@@ -121,6 +121,29 @@ def test_another_s_change_is_shown_and_one_chooses(
         page.get_by_role("button", name="Save as a new revision").click()
         expect(page.get_by_text("revision 3").first).to_be_visible()
         assert read(served, phone["name"])["k_cam_px"] == 1.7
+
+
+@pytest.mark.parametrize(
+    ("asked", "opened", "pressed"), [("curve", None, "Edit"), ("cameras/preview", "Edit", "Save as a new revision")]
+)
+def test_what_one_presses_stays_where_it_is_when_the_curve_arrives(
+    page: Page, served: Server, d200: dict[str, Any], asked: str, opened: str | None, pressed: str
+) -> None:
+    held: list[Route] = []
+
+    def hold(route: Route) -> None:
+        held.append(route)
+
+    page.route(f"**/{asked}*", hold)
+    with page.expect_request(f"**/{asked}*"):
+        open_camera(page, served, d200)
+        if opened:
+            page.get_by_role("button", name=opened).click()
+    button = page.get_by_role("button", name=pressed)
+    before = button.bounding_box()
+    held[0].continue_()
+    expect(page.get_by_role("img", name="Blur against distance")).to_be_visible()
+    assert button.bounding_box() == before
 
 
 def test_revisions_say_what_changed(page: Page, served: Server, phone: dict[str, Any]) -> None:
