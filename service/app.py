@@ -12,7 +12,20 @@ from fastapi_offline import FastAPIOffline
 from threadpoolctl import threadpool_limits
 
 from service.access import Authenticate
-from service.api import calibrations, cameras, depth, handlers, health, look, metrics, model, openapi, pages, target
+from service.api import (
+    calibrations,
+    cameras,
+    depth,
+    handlers,
+    health,
+    look,
+    metrics,
+    model,
+    openapi,
+    pages,
+    photographs,
+    target,
+)
 from service.calibration.calibrate import calibrate
 from service.config import Settings
 from service.inference.artifact import load_model_folder
@@ -31,6 +44,7 @@ from service.tracing import Tracing
 DEPTH_PATH = "/depth"
 FROM_PHOTO_PATH = "/cameras/from-photo"
 LOOK_PATH = "/calibrate/look"
+PREVIEW_PATH = "/photographs/preview"
 CALIBRATE_PATH = "/calibrate"
 DESCRIPTION = """\
 How far away is each pixel of this single photograph, in metres, given the camera that took it?
@@ -68,7 +82,7 @@ def create_app(settings: Settings, calibrate: Calibrate = calibrate) -> FastAPI:
     app.state.is_stopping = False
     _add_middleware(app, settings)
     handlers.install(app)
-    for part in (cameras, depth, calibrations, look, target, model, health, metrics, pages):
+    for part in (cameras, depth, photographs, calibrations, look, target, model, health, metrics, pages):
         app.include_router(part.router)
     # FastAPI's own way to another description: https://fastapi.tiangolo.com/how-to/extending-openapi/
     replaceable: Any = app
@@ -86,6 +100,7 @@ def _add_middleware(app: FastAPI, settings: Settings) -> None:
             DEPTH_PATH: photograph,
             FROM_PHOTO_PATH: photograph,
             LOOK_PATH: photograph,
+            PREVIEW_PATH: photograph,
             CALIBRATE_PATH: BodyLimits(settings.max_calibration_bytes, settings.calibration_receive_deadline_s),
         },
     )

@@ -123,6 +123,7 @@ def test_a_key_opens_what_its_scope_names_and_nothing_else(app: FastAPI, client:
         ("GET", "/metrics", "admin"),
         ("GET", "/calibrate/target.pdf", None),
         ("GET", "/model", None),
+        ("POST", "/photographs/preview", None),
         ("GET", "/camerasx", None),
     ],
 )

@@ -1,4 +1,4 @@
-"""A DepthMap as bytes: PNG16, NPY, NPZ, TIFF, PLY and a preview; and its numbers for JSON.
+"""A DepthMap as bytes: PNG16, NPY, NPZ, TIFF, PLY and a preview; its numbers for JSON; and the photograph itself.
 
 Units and the sign for no answer are those of ROS REP 118: float metres with NaN, or millimetres with 0.
 """
@@ -133,8 +133,21 @@ def encode_ply(answer: DepthMap, rgb: NDArray[np.uint8]) -> Encoded:
 
 def encode_preview(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
     """JPEG in turbo colours, near red and far blue, grey without an answer, with a legend in metres."""
-    pixels = render_preview(answer.depth_m)
-    body = cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), (cv2.IMWRITE_JPEG_QUALITY, 90))[1]
+    return _jpeg(render_preview(answer.depth_m))
+
+
+def encode_photograph(rgb: NDArray[np.uint8], longest_px: int) -> Encoded:
+    """JPEG of a picture [h, w, 3], its longer side at most so long."""
+    height, width = rgb.shape[:2]
+    scale = longest_px / max(height, width)
+    if scale < 1:
+        size = (max(1, round(width * scale)), max(1, round(height * scale)))
+        rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return _jpeg(rgb)
+
+
+def _jpeg(rgb: NDArray[np.uint8]) -> Encoded:
+    body = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), (cv2.IMWRITE_JPEG_QUALITY, 90))[1]
     return Encoded(body.tobytes(), MEDIA_TYPES["preview"])
 
 

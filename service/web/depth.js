@@ -8,7 +8,7 @@ import { DraftForm } from "./draft_form.js";
 import { Exports } from "./exports.js";
 import { Legend } from "./legend.js";
 import { short } from "./numbers.js";
-import { PHOTOGRAPHS, mediaTypeOf } from "./photograph_files.js";
+import { PHOTOGRAPHS, mediaTypeOf, previewOf } from "./photograph_files.js";
 import { ProblemBox } from "./problem_box.js";
 import { DepthReader } from "./reader.js";
 import { Distance, Readout, Timings, metres } from "./readout.js";
@@ -64,6 +64,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
   const [counts, setCounts] = useState(/** @type {Uint32Array | null} */ (null));
   const [measured, setMeasured] = useState(/** @type {Measured | null} */ (null));
   const running = useRef(/** @type {AbortController | null} */ (null));
+  const newest = useRef(/** @type {File | null} */ (null));
 
   const camera = cameras?.find((one) => one.name === name) ?? null;
   const ask = { camera: name, side, focusM };
@@ -80,7 +81,16 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
     setPhotograph(null);
     setIsDrafting(false);
     setFile(taken);
-    setPhotograph(await reader.ask("photograph", { file: taken, mostPx: PHOTOGRAPH_MOST_PX }).catch(() => null));
+    newest.current = taken;
+    const isNewest = () => newest.current === taken;
+    const read = (/** @type {Blob} */ shown) =>
+      reader.ask("photograph", { file: shown, mostPx: PHOTOGRAPH_MOST_PX }).catch(() => null);
+    let found = await read(taken);
+    if (found === null && isNewest()) {
+      const preview = await previewOf(taken, PHOTOGRAPH_MOST_PX);
+      if (preview && isNewest()) found = await read(preview);
+    }
+    if (isNewest()) setPhotograph(found);
   }, []);
 
   useFilesFromOutside(shown, take);

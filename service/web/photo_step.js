@@ -4,7 +4,7 @@ import { Problem, getJson, problemOf } from "./api.js";
 import { Chart } from "./chart.js";
 import { WANTED, adviceFor, coverageOf, focusOf } from "./guidance.js";
 import { counted, measure } from "./numbers.js";
-import { PHOTOGRAPHS, mediaTypeOf } from "./photograph_files.js";
+import { PHOTOGRAPHS, mediaTypeOf, previewOf } from "./photograph_files.js";
 import { html, useEffect, useRef, useState } from "./vendor/preact.js";
 
 const THUMB_PX = 320;
@@ -252,14 +252,11 @@ function Thumb({ file, look }) {
   useEffect(() => {
     let made = /** @type {ImageBitmap | null} */ (null);
     let isGone = false;
-    createImageBitmap(file, { resizeWidth: THUMB_PX, resizeQuality: "medium" }).then(
-      (found) => {
-        made = found;
-        if (isGone) found.close();
-        else setBitmap(found);
-      },
-      () => {}, // a raw photograph, which browsers do not show
-    );
+    thumbOf(file).then((found) => {
+      made = found;
+      if (isGone) found?.close();
+      else setBitmap(found);
+    });
     return () => {
       isGone = true;
       made?.close();
@@ -270,6 +267,16 @@ function Thumb({ file, look }) {
   }, [bitmap, look]);
   const words = look?.found ? `${file.name} with ${look.circles.length} circles found` : file.name;
   return html`<canvas ref=${canvas} role="img" aria-label=${words}></canvas>`;
+}
+
+/** @param {File} file @returns {Promise<ImageBitmap | null>} null where nobody can show it */
+async function thumbOf(file) {
+  const small = (/** @type {Blob} */ shown) =>
+    createImageBitmap(shown, { resizeWidth: THUMB_PX, resizeQuality: "medium" }).catch(() => null);
+  const found = await small(file);
+  if (found !== null) return found;
+  const preview = await previewOf(file, THUMB_PX);
+  return preview && small(preview);
 }
 
 /** @param {HTMLCanvasElement} canvas @param {ImageBitmap | null} bitmap @param {any | null} look */

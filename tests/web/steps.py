@@ -1,9 +1,13 @@
 """What tests of the page and its pictures do alike."""
 
+import time
+from collections.abc import Callable
+
 from playwright.sync_api import Page
 
 from tests.simulated_sheets import GRID
 
+PATIENCE_S = 60
 OVERFLOW = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
 SHEET = {"Rows": GRID.rows, "Columns": GRID.columns, "Spacing (mm)": GRID.spacing_mm, "Diameter (mm)": GRID.diameter_mm}
 
@@ -17,3 +21,11 @@ def to_photographs(page: Page, name: str, ruler_mm: str = "100") -> None:
     page.get_by_label("Measure this").fill(ruler_mm)
     page.get_by_role("button", name="Next: photographs").click()
     page.get_by_label("Camera", exact=True).fill(name)
+
+
+def eventually(page: Page, is_so: Callable[[], bool]) -> None:
+    """Wait until something is so that no locator can expect; the page goes on meanwhile."""
+    give_up = time.monotonic() + PATIENCE_S
+    while not is_so():
+        assert time.monotonic() < give_up
+        page.wait_for_timeout(50)

@@ -12,11 +12,16 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from model_export.served import Server, serving
+from tests.inference.photographs import tiff
 from tests.simulated_sheets import CAMERA, DEPTHS_M, GRID, shots
-from tests.web.steps import OVERFLOW, to_photographs
+from tests.web.steps import OVERFLOW, eventually, to_photographs
 from tests.web.watched import watched
 
 LONG_MS = 120_000
+GREY = """(canvas) => {
+  const {data} = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+  return Array.from({length: data.length / 4}, (_, at) => (data[4 * at] + data[4 * at + 1] + data[4 * at + 2]) / 3);
+}"""
 K_CAM = {
     "image_width_px": CAMERA.width_px,
     "image_height_px": CAMERA.height_px,
@@ -69,6 +74,25 @@ def test_the_sheet_is_what_the_service_prints(page: Page, served: Server, expect
     page.get_by_label("Spacing (mm)").fill("60")
     expect(page.get_by_label("Spacing (mm)")).to_have_accessible_description(re.compile("too large for a4"))
     expect(page.get_by_role("button", name="Next: photographs")).to_be_disabled()
+
+
+def test_a_photograph_that_browsers_do_not_show_is_shown_with_its_circles(
+    page: Page, photographs: list[Path], tmp_path: Path, name: str
+) -> None:
+    pixels = np.asarray(cv2.imread(str(photographs[0]), cv2.IMREAD_COLOR_RGB), np.uint8)
+    scan = tmp_path / "scan.tiff"
+    scan.write_bytes(tiff(pixels))
+    to_photographs(page, name)
+    drop(page, scan)
+    shown = page.get_by_role("img", name="scan.tiff with 21 circles found")
+    expect(shown).to_be_visible()
+    expected = cv2.resize(pixels, (320, 240), interpolation=cv2.INTER_AREA).mean(2)
+
+    def is_like_it() -> bool:
+        drawn = np.array(shown.evaluate(GREY))
+        return bool(drawn.size == expected.size and np.corrcoef(drawn, expected.ravel())[0, 1] > 0.9)
+
+    eventually(page, is_like_it)
 
 
 def test_every_photograph_says_at_once_what_it_shows(

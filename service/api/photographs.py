@@ -1,0 +1,60 @@
+"""``POST /photographs/preview``: a photograph as a picture that every browser shows."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request, Response
+
+from service.api.clients import unless_gone
+from service.api.dependencies import SettingsDep, WorkerDep
+from service.api.problems import responses
+from service.api.uploads import REQUEST_BODY, Upload, receive_photograph
+from service.errors import BadRequest, Busy, InvalidImage, TooLarge, UnsupportedKind
+from service.inference.cancellation import Cancellation
+from service.inference.encode import Encoded, encode_photograph
+from service.inference.images import ImageLimits, read_photograph
+
+router = APIRouter(prefix="/photographs", tags=["depth"])
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """Everything the work needs, so that it does not touch the request."""
+
+    upload: Upload
+    longest_px: int
+    limits: ImageLimits
+
+
+@router.post(
+    "/preview",
+    operation_id="previewPhotograph",
+    summary="A photograph of any kind as a JPEG",
+    response_class=Response,
+    responses={
+        200: {
+            "description": "The upright photograph, made small",
+            "content": {"image/jpeg": {"schema": {"type": "string", "format": "binary"}}},
+        },
+        **responses(TooLarge, UnsupportedKind, BadRequest, InvalidImage, Busy),
+    },
+    openapi_extra={"requestBody": REQUEST_BODY},
+)
+async def preview_photograph(
+    request: Request,
+    settings: SettingsDep,
+    worker: WorkerDep,
+    longest_px: Annotated[int, Query(ge=16, le=4096, description="Its longer side at most")] = 1600,
+) -> Response:
+    """What HEIC and raw files show, for browsers that do not read them. Nothing is stored."""
+    upload = await receive_photograph(request, settings.max_image_bytes)
+    order = Order(upload, longest_px, ImageLimits.of(settings))
+    encoded = (await unless_gone(request, worker.run(fulfil, order))).value
+    return Response(encoded.body, media_type=encoded.media_type)
+
+
+def fulfil(cancellation: Cancellation, order: Order) -> Encoded:
+    """Decode and encode: all the work of a request, in one thread."""
+    photograph = read_photograph(order.upload.data, order.upload.media_type, order.limits)
+    cancellation.check()
+    return encode_photograph(photograph.rgb, order.longest_px)
