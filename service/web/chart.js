@@ -9,6 +9,7 @@ const LEFT = 64;
 const RIGHT = 14;
 const TOP = 14;
 const BOTTOM = 46;
+const LINE = 16; // so that two words never run into each other
 const MOST_ROWS = 30;
 
 /** @typedef {{x: number, y: number, low?: number, high?: number, label?: string}} Point */
@@ -59,11 +60,11 @@ export function Chart({ title, x, y, series, marks = [] }) {
         )}
         <line class="axis" x1=${LEFT} x2=${width - RIGHT} y1=${HEIGHT - BOTTOM} y2=${HEIGHT - BOTTOM} />
         ${marks.map(
-          (mark) => html`<g class="mark">
+          (mark, row) => html`<g class="mark">
             <line x1=${across.scale(mark.x)} x2=${across.scale(mark.x)} y1=${TOP} y2=${HEIGHT - BOTTOM} />
             <text
               x=${across.scale(mark.x) + (across.scale(mark.x) > width / 2 ? -5 : 5)}
-              y=${TOP + 10}
+              y=${TOP + 10 + row * LINE}
               text-anchor=${across.scale(mark.x) > width / 2 ? "end" : "start"}
             >
               ${mark.label}
