@@ -20,10 +20,10 @@ from model_export.textures import draw_texture
 from service.optics import thin_lens
 from service.optics.light import decode_srgb, encode_srgb
 
-BOTH_SIDES_SHARE = 0.4
+BOTH_SIDES_SHARE = 0.55  # something before and something beyond what is in focus, as in most photographs
 # what people photograph is a few metres away: the background of a close-up is beyond its focus, and what a distant
 # focus shows is mostly nearer
-USUAL_DEPTH_M, DEPTH_SPREAD = 2.0, 0.8  # median, and standard deviation of the logarithm
+USUAL_DEPTH_M, DEPTH_SPREAD = 2.0, 1.2  # median, and standard deviation of the logarithm
 LIKELIEST_SIDE = 0.85
 ROOM_SHARE = 0.5
 WALL_SHARE = 0.2  # nothing but a wall: what people photograph first, and what rooms seldom hold
@@ -33,7 +33,7 @@ NEAREST_AT_MOST, FARTHEST_AT_LEAST = 0.5, 2.0
 CLOSE_SHARE = 0.5
 FOCUSED_SHARE = 0.2  # somebody focused on something: sharp is read as blurred by who seldom saw it
 K_CAM_LEAN = 0.5  # so that every octave of blur has about its share: what is rare is read as what is common
-DISC_SHARE, GAUSSIAN_SHARE = 0.4, 0.3  # opened-up lenses have discs, soft ones come near a bell
+DISC_SHARE, GAUSSIAN_SHARE = 0.5, 0.2  # lenses have discs, softened where they are soft; fewer come near a bell
 ROUND_SHARE = 0.7
 CHROMATIC_SHARE = 0.4
 CHROMATIC_PX = 0.8
@@ -80,12 +80,16 @@ def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float], lean: fl
     return math.exp(low + (high - low) * rng.random() ** lean)
 
 
+def _nearer_share(focus_distance_m: float) -> float:
+    """Of what people photograph, how much is nearer than that."""
+    nearer = NormalDist(math.log(USUAL_DEPTH_M), DEPTH_SPREAD).cdf(math.log(focus_distance_m))
+    return min(max(nearer, 1 - LIKELIEST_SIDE), LIKELIEST_SIDE)
+
+
 def draw_shot(rng: np.random.Generator, config: SceneConfig) -> Shot:
     """A random camera, focus distance, lens and side of focus within the config's ranges."""
     focus_distance_m = _log_uniform(rng, config.focus_distance_m)
-    nearer = NormalDist(math.log(USUAL_DEPTH_M), DEPTH_SPREAD).cdf(math.log(focus_distance_m))
-    nearer = min(max(nearer, 1 - LIKELIEST_SIDE), LIKELIEST_SIDE)
-    side = 0 if rng.random() < BOTH_SIDES_SHARE else -1 if rng.random() < nearer else 1
+    side = 0 if rng.random() < BOTH_SIDES_SHARE else -1 if rng.random() < _nearer_share(focus_distance_m) else 1
     k_cam_px = _log_uniform(rng, config.k_cam_px, K_CAM_LEAN)
     return Shot(
         k_cam_px=k_cam_px,
@@ -127,7 +131,7 @@ def _excess_bounds(shot: Shot, config: SceneConfig) -> tuple[float, float]:
 def _draw_excess(rng: np.random.Generator, shot: Shot, config: SceneConfig) -> float:
     """q - 1 of one surface on a side of the shot: at times in focus, else uniform or log-uniform in blur."""
     low, high = _excess_bounds(shot, config)
-    far = shot.side > 0 or (shot.side == 0 and rng.random() < 0.5)
+    far = shot.side > 0 or (shot.side == 0 and rng.random() > _nearer_share(shot.focus_distance_m))
     end = -low if far else high
     first = min(config.defocus_px[0] / shot.k_cam_px, end / 2)
     if rng.random() < FOCUSED_SHARE:

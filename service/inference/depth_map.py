@@ -17,6 +17,7 @@ from service.optics.camera import Camera
 
 MAX_RELATIVE_ERROR = 1.0
 NO_ANSWER = np.float32(1e3)  # a relative error that no reading states
+LEAST_P_NEAR = np.float32(0.35)
 LEAST_BLUR_ERROR_PX = 0.05  # nobody reads blur better: no stated error is below what it does to depth
 SIGMA_OF_LAPLACE = np.float32(2**0.5)
 
@@ -199,17 +200,26 @@ def _sampled(reading: Reading, rows: slice, width: int) -> Layers:
     return Layers(*(sample(values, reading.ratio, rows, width) for values in maps))
 
 
+def _near_from(near_m: Array, far_m: Array) -> Array:
+    """The probability of near from which near is the answer: above it, its relative error is the lesser on average.
+
+    Far for what is near is off by far / near - 1, near for what is far by 1 - near / far, which is never as much. It is
+    not below ``LEAST_P_NEAR``, for the network's probabilities are not that exact.
+    """
+    return np.maximum(near_m / (near_m + far_m), LEAST_P_NEAR)
+
+
 def _told(layers: Layers, reading: Reading, side: Side) -> Layers:
     """The layers with depth where it is, ``sigma_m`` relative yet.
 
-    The side is what the network tells unless it is given; where no far answer can exist it is near, always. No error
-    is stated below the floor of optics.
+    The side is the one that is off by less, unless it is given; where no far answer can exist it is near, always. No
+    error is stated below the floor of optics.
     """
     near_m, far_m, p_near, error = layers.depth_m, layers.depth_alt_m, layers.p_near, layers.sigma_m
     if side != "auto":
         p_near.fill(side == "near")
     np.copyto(p_near, 1, where=np.isnan(far_m))
-    is_far = p_near < 0.5
+    is_far = p_near < _near_from(near_m, far_m)
     depth_m = np.where(is_far, far_m, near_m)
     np.copyto(far_m, near_m, where=is_far)
     near_m[:] = depth_m

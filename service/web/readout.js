@@ -10,8 +10,11 @@ export function metres(value, digits = 3) {
   return `${value.toFixed(digits)} m`;
 }
 
-/** @param {{reading: import("./maps.js").Reading | null}} props */
+/** @typedef {import("./maps.js").Reading} Reading */
+
+/** @param {{reading: Reading | null}} props */
 export function Readout({ reading }) {
+  const [side, likelihood] = reading ? sideOf(reading) : ["", 0];
   return html`<section class="card stack depth-readout" aria-label="Under the pointer">
     <h3>Under the pointer</h3>
     ${reading === null
@@ -25,12 +28,12 @@ export function Readout({ reading }) {
           </p>
           <dl class="facts">
             <dt>Side</dt>
-            <dd>${sideOf(reading.pNear)}</dd>
+            <dd>${side}, ${percent(likelihood)}</dd>
             <dt>Or else</dt>
             <dd data-value="other">
               ${reading.otherM === null
                 ? "no other distance fits"
-                : `${metres(reading.otherM)}, ${percent(Math.min(reading.pNear, 1 - reading.pNear))}`}
+                : `${metres(reading.otherM)}, ${percent(1 - likelihood)}`}
             </dd>
             <dt>Blur</dt>
             <dd data-value="blur">${reading.blurPx.toFixed(2)} px</dd>
@@ -88,10 +91,13 @@ export function Timings({ timings, model }) {
   </details>`;
 }
 
-/** @param {number} pNear */
-function sideOf(pNear) {
-  if (pNear >= 0.5) return `nearer than focus, ${percent(pNear)}`;
-  return `beyond focus, ${percent(1 - pNear)}`;
+/**
+ * @param {Reading} reading
+ * @returns {[string, number]} the side that the answer is on, and how likely that is
+ */
+function sideOf({ depthM, otherM, pNear }) {
+  const isNear = depthM !== null && otherM !== null ? depthM < otherM : pNear >= 0.5;
+  return isNear ? ["nearer than focus", pNear] : ["beyond focus", 1 - pNear];
 }
 
 /** @param {number} share */

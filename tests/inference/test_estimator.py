@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from service.inference.artifact import Interval, load_model_folder
 from service.inference.cancellation import Cancellation, Cancelled
-from service.inference.depth_map import LEAST_BLUR_ERROR_PX, Reading
+from service.inference.depth_map import LEAST_BLUR_ERROR_PX, Reading, all_layers, decide
 from service.inference.estimator import Estimator
 from service.inference.pair import MAPS, GraphPair, RawMaps, Side
 from service.inference.part import Part
@@ -95,6 +95,32 @@ def test_blur_no_surer_than_that_may_lie_beyond_focus_all_the_same(
     maps = {name: np.full((32, 48), value, np.float32) for name, value in values.items()}
     reading = Reading.of(maps, CAMERA, (64, 96), load_model_folder(folder).manifest)
     assert np.isfinite(reading.far_m).all() == may_be_beyond
+
+
+@pytest.mark.parametrize(
+    ("near_m", "far_m", "p_near", "is_near"),
+    [
+        (1.5, 3.0, 0.34, False),
+        (1.5, 3.0, 0.36, True),
+        (1.5, 2.0, 0.42, False),
+        (1.5, 2.0, 0.44, True),
+        (0.2, 9.0, 0.34, False),
+        (1.99, 2.01, 0.49, False),
+        (1.99, 2.01, 0.51, True),
+    ],
+)
+def test_the_side_is_the_one_that_is_off_by_less_on_average(
+    folder: Path, near_m: float, far_m: float, p_near: float, is_near: bool
+) -> None:
+    values = dict.fromkeys(MAPS, 0.0) | {"blur_px": 2.0, "blur_log_error": -3.0, "p_near": p_near, "log_scale": -3.0}
+    values |= {"log_ratio_near": np.log(near_m / 2), "log_ratio_far": np.log(far_m / 2)}
+    maps = {name: np.full((32, 48), value, np.float32) for name, value in values.items()}
+    reading = Reading.of(maps, CAMERA, (64, 96), load_model_folder(folder).manifest)
+    answer, other = (near_m, far_m) if is_near else (far_m, near_m)
+    np.testing.assert_allclose(decide([reading], (64, 96), "auto")[0], answer, rtol=1e-4)
+    layers = all_layers([reading], (64, 96), "auto")()
+    np.testing.assert_allclose(layers.depth_alt_m, other, rtol=1e-4)
+    np.testing.assert_allclose(layers.p_near, p_near, rtol=1e-4)
 
 
 def test_auto_follows_the_features_handed_from_graph_to_graph(estimator: Estimator) -> None:

@@ -58,7 +58,7 @@ def test_most_lenses_blur_red_and_blue_more_before_the_focus_than_beyond() -> No
 
 
 @pytest.mark.parametrize(
-    ("focus_m", "nearer", "beyond"), [(0.3, (0.02, 0.2), (0.4, 0.65)), (5.0, (0.4, 0.65), (0.02, 0.2))]
+    ("focus_m", "nearer", "beyond"), [(0.3, (0.02, 0.15), (0.3, 0.5)), (5.0, (0.3, 0.5), (0.02, 0.15))]
 )
 def test_beyond_a_close_focus_lies_what_is_seen_and_before_a_distant_one(
     focus_m: float, nearer: tuple[float, float], beyond: tuple[float, float]
@@ -66,5 +66,13 @@ def test_beyond_a_close_focus_lies_what_is_seen_and_before_a_distant_one(
     rng = np.random.default_rng(0)
     config = SceneConfig(focus_distance_m=(focus_m, focus_m))
     sides = np.array([draw_shot(rng, config).side for _ in range(400)])
-    for side, (low, high) in ((-1, nearer), (1, beyond), (0, (0.3, 0.5))):
+    for side, (low, high) in ((-1, nearer), (1, beyond), (0, (0.45, 0.65))):
         assert low < (sides == side).mean() < high
+
+
+@pytest.mark.parametrize(("focus_m", "beyond"), [(0.3, (0.65, 0.95)), (2.0, (0.3, 0.7)), (5.0, (0.05, 0.35))])
+def test_where_both_sides_are_seen_the_focus_says_how_much_of_each(focus_m: float, beyond: tuple[float, float]) -> None:
+    config = SceneConfig(size_px=32, margin_px=8, focus_distance_m=(focus_m, focus_m))
+    samples = [sample for sample in (draw_sample(seed, config, []) for seed in range(80)) if sample.shot.side == 0]
+    low, high = beyond
+    assert low < np.mean([(sample.excess < 0).mean() for sample in samples]) < high
