@@ -20,7 +20,7 @@ from service.optics.camera import Camera
 from tests.inference.oracle_pair import LOG_DEPTH_SCALE, RELATIVE_BLUR_ERROR, blur_of, build_oracle_pair
 
 CAMERA = Camera(96, 64, 2.0, 6.0, 0.5)
-LEVEL = 90
+LEVEL = 85
 
 
 @pytest.fixture(scope="module")

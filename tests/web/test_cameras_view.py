@@ -18,11 +18,16 @@ LENS = {"Focal length (mm)": "35", "f-number": "2.8", "Pixel pitch (µm)": "6.05
 FRAME = {"Image width (px)": "645", "Image height (px)": "432", "Focus distance (m)": "2"}
 
 
-@pytest.fixture(autouse=True)
-def no_cameras(served: Server) -> Iterator[None]:
-    yield
+def forget_cameras(served: Server) -> None:
     for camera in served.ask("GET", "/cameras").json()["items"]:
         served.ask("DELETE", f"/cameras/{camera['name']}")
+
+
+@pytest.fixture(autouse=True)
+def no_cameras(served: Server) -> Iterator[None]:
+    forget_cameras(served)  # those of other files' tests
+    yield
+    forget_cameras(served)
 
 
 @pytest.fixture
