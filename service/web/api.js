@@ -1,6 +1,5 @@
 /**
  * The service's API: requests that carry the API key, and every failure as a `Problem`.
- *
  * Paths are relative to the page ("cameras"), so that it works behind a prefix.
  */
 
@@ -36,10 +35,7 @@ export class Problem extends Error {
   }
 }
 
-/**
- * @param {unknown} error
- * @returns {Problem} the error, if it is one; else it is thrown on
- */
+/** @param {unknown} error @returns {Problem} the error, if it is one; else it is thrown on */
 export function problemOf(error) {
   if (error instanceof Problem) return error;
   throw error;
@@ -68,7 +64,6 @@ let asking = null;
 
 /**
  * The key, asked for once however many requests want it.
- *
  * @param {string | null} reason
  */
 async function askedKey(reason) {
@@ -85,7 +80,6 @@ async function askedKey(reason) {
 
 /**
  * Send with the key, as often as the service refuses it and another is given.
- *
  * @template {{status: number}} T
  * @param {(headers: Record<string, string>) => Promise<T>} send
  * @param {(answer: T) => Promise<Problem>} toProblem
@@ -160,7 +154,6 @@ export async function request(path, options = {}) {
 
 /**
  * An answer with its body, which may break off too.
- *
  * @param {"json" | "blob" | "text"} kind
  * @param {string} path
  * @param {RequestOptions} [options]
@@ -216,7 +209,6 @@ export async function everyCamera() {
 
 /**
  * Send a body with progress.
- *
  * @param {string} path
  * @param {RequestOptions & {onProgress?: (fraction: number | null) => void, responseType?: XMLHttpRequestResponseType}} [options]
  *   `onProgress` gets the part sent, 0 to 1, or null where it is unknown
@@ -269,7 +261,6 @@ function sendWithProgress(path, { method = "POST", headers = {}, body = null, si
 
 /**
  * Read server-sent events until the stream ends; EventSource cannot send a key.
- *
  * @param {string} path
  * @param {{signal?: AbortSignal, onEvent: (event: {event: string, data: string}) => void}} options
  */
@@ -293,10 +284,7 @@ export async function events(path, { signal, onEvent }) {
   }
 }
 
-/**
- * @param {string} block
- * @param {(event: {event: string, data: string}) => void} onEvent
- */
+/** @param {string} block @param {(event: {event: string, data: string}) => void} onEvent */
 function readEvent(block, onEvent) {
   /** @type {string[]} */
   const data = [];

@@ -204,9 +204,7 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
   `;
 }
 
-/**
- * @param {{items: any[], open: string | null, onOpen: (id: string) => void}} props
- */
+/** @param {{items: any[], open: string | null, onOpen: (id: string) => void}} props */
 function Recent({ items, open, onOpen }) {
   if (items.length === 0) return null;
   return html`
@@ -243,7 +241,6 @@ function Recent({ items, open, onOpen }) {
 
 /**
  * Follows a calibration until it has ended; a stream that breaks is opened again.
- *
  * @param {any | null} job
  * @param {(job: any) => void} setJob
  * @param {(problem: Problem | null) => void} setProblem

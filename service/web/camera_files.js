@@ -8,18 +8,13 @@ import { html, useEffect, useRef, useState } from "./vendor/preact.js";
 
 /** @typedef {{camera: any, name: string, does: "create" | "update" | "nothing" | "refuse" | "done", words: string, revision: number | null}} Step */
 
-/**
- * @param {any[]} cameras
- * @param {string} name of the file
- */
+/** @param {any[]} cameras @param {string} name of the file */
 export function exportCameras(cameras, name) {
   const text = `${JSON.stringify({ cameras: cameras.map(specsOf) }, null, 2)}\n`;
   save(new Blob([text], { type: "application/json" }), `${name}.json`);
 }
 
-/**
- * @param {{file: File, onClose: (stored: number) => void}} props
- */
+/** @param {{file: File, onClose: (stored: number) => void}} props */
 export function ImportDialog({ file, onClose }) {
   const dialog = useRef(/** @type {HTMLDialogElement | null} */ (null));
   const [steps, setSteps] = useState(/** @type {Step[] | null} */ (null));
@@ -80,10 +75,7 @@ export function ImportDialog({ file, onClose }) {
 const LABELS = { create: "new", update: "changes", nothing: "the same", refuse: "refused", done: "stored" };
 const TONES = { create: "good", update: "warn", nothing: "", refuse: "bad", done: "good" };
 
-/**
- * @param {File} file
- * @returns {Promise<Step[]>}
- */
+/** @param {File} file @returns {Promise<Step[]>} */
 async function planOf(file) {
   /** @type {any} */
   let content;

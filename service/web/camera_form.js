@@ -188,7 +188,6 @@ function Field({ path, label, value, kind = "decimal", hint, disabled = false, f
 
 /**
  * What somebody else stored while this was edited, and whose is to stay.
- *
  * @param {{base: any, theirs: any, fields: Fields, onMine: () => void, onTheirs: () => void}} props
  */
 function Conflict({ base, theirs, fields, onMine, onTheirs }) {
@@ -228,7 +227,6 @@ function Conflict({ base, theirs, fields, onMine, onTheirs }) {
 
 /**
  * The service's answer to the fields, a moment after the last change.
- *
  * @param {Fields} fields
  * @returns {{preview: any | null, faults: import("./api.js").FieldProblem[]}}
  */

@@ -16,7 +16,6 @@ const MOST_ROWS = 30;
 
 /**
  * `line` and `dots` draw the points, `band` what is between their `low` and `high`.
- *
  * @typedef {{name: string, kind: "line" | "band" | "dots", tone: string, points: Point[]}} Series
  */
 

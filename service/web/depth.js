@@ -8,7 +8,7 @@ import { DraftForm } from "./draft_form.js";
 import { Exports } from "./exports.js";
 import { Legend } from "./legend.js";
 import { short } from "./numbers.js";
-import { PHOTOGRAPHS, mediaTypeOf, previewOf } from "./photograph_files.js";
+import { PHOTOGRAPHS, mediaTypeOf, readShown } from "./photograph_files.js";
 import { ProblemBox } from "./problem_box.js";
 import { DepthReader } from "./reader.js";
 import { Distance, Readout, Timings, metres } from "./readout.js";
@@ -83,13 +83,10 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
     setFile(taken);
     newest.current = taken;
     const isNewest = () => newest.current === taken;
-    const read = (/** @type {Blob} */ shown) =>
-      reader.ask("photograph", { file: shown, mostPx: PHOTOGRAPH_MOST_PX }).catch(() => null);
-    let found = await read(taken);
-    if (found === null && isNewest()) {
-      const preview = await previewOf(taken, PHOTOGRAPH_MOST_PX);
-      if (preview && isNewest()) found = await read(preview);
-    }
+    const mostPx = PHOTOGRAPH_MOST_PX;
+    const found = await readShown(taken, mostPx, async (shown) =>
+      isNewest() ? reader.ask("photograph", { file: shown, mostPx }).catch(() => null) : null,
+    );
     if (isNewest()) setPhotograph(found);
   }, []);
 
@@ -120,10 +117,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
     return () => abort.abort();
   }, [file, camera?.name, camera?.revision, side, focusM, attempt]);
 
-  /**
-   * @param {File} sent
-   * @param {AbortSignal} signal
-   */
+  /** @param {File} sent @param {AbortSignal} signal */
   async function run(sent, signal) {
     const show = (/** @type {Phase | null} */ next) => signal.aborted || setPhase(next);
     setProblem(null);
@@ -299,7 +293,6 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 
 /**
  * Photographs that are dropped anywhere on the view, or pasted.
- *
  * @param {boolean} shown
  * @param {(file: File | null | undefined) => void} take
  */
@@ -452,10 +445,7 @@ function Warnings({ texts }) {
   </ul>`;
 }
 
-/**
- * @param {string} text
- * @returns {"camera" | "focus" | "result"} beside what it should be read
- */
+/** @param {string} text @returns {"camera" | "focus" | "result"} beside what it should be read */
 function placeOfWarning(text) {
   if (text.includes("focal length")) return "focus";
   return text.includes("k_cam_px") ? "camera" : "result";
@@ -468,10 +458,7 @@ function about({ image_width_px, image_height_px, focus_distance_m, range_m, des
   return description ? `${description}. ${numbers}` : numbers;
 }
 
-/**
- * @param {string} header `decode;dur=1.2, wait;dur=0.1`
- * @returns {[string, number][]}
- */
+/** @param {string} header `decode;dur=1.2, wait;dur=0.1` @returns {[string, number][]} */
 function readTimings(header) {
   return Array.from(header.matchAll(/([\w-]+);dur=([\d.]+)/g), ([, stage, ms]) => [stage, Number(ms)]);
 }

@@ -191,7 +191,6 @@ function Residuals({ result: { samples, curve } }) {
 
 /**
  * The service's curve between two of its points.
- *
  * @param {any[]} curve
  * @param {number} depth
  * @returns {number | null}

@@ -4,7 +4,7 @@ import { Problem, getJson, problemOf } from "./api.js";
 import { Chart } from "./chart.js";
 import { WANTED, adviceFor, coverageOf, focusOf } from "./guidance.js";
 import { counted, measure } from "./numbers.js";
-import { PHOTOGRAPHS, mediaTypeOf, previewOf } from "./photograph_files.js";
+import { PHOTOGRAPHS, mediaTypeOf, readShown } from "./photograph_files.js";
 import { html, useEffect, useRef, useState } from "./vendor/preact.js";
 
 const THUMB_PX = 320;
@@ -14,7 +14,6 @@ const EXPOSURES = { good: "good", over: "too bright", under: "too dark" };
 
 /**
  * `asked` is what the look, or the problem, answers: another pattern or camera asks anew.
- *
  * @typedef {{id: number, file: File, role: Role, asked: string, look: any | null, problem: Problem | null}} Photo
  */
 
@@ -45,7 +44,6 @@ function photosOf(files, role) {
 
 /**
  * Looks at one photograph after the other, whenever there is one that was not.
- *
  * @param {Photo[]} photos
  * @param {(change: (before: Photo[]) => Photo[]) => void} setPhotos
  * @param {string} query the pattern and camera
@@ -141,7 +139,6 @@ function seenOf({ role, look }) {
 
 /**
  * Whether a defocused photograph has a focused one to tell where its circles are.
- *
  * @param {Photo} photo
  * @param {Photo[]} photos
  */
@@ -150,9 +147,7 @@ function hasPartner(photo, photos) {
   return place >= 0 && Boolean(photos.filter(({ role }) => role === "focused")[place]?.look?.found);
 }
 
-/**
- * @param {{role: Role, title: string, words: string, onFiles: (files: File[]) => void}} props
- */
+/** @param {{role: Role, title: string, words: string, onFiles: (files: File[]) => void}} props */
 function DropZone({ role, title, words, onFiles }) {
   const input = useRef(/** @type {HTMLInputElement | null} */ (null));
   const [isOver, setIsOver] = useState(false);
@@ -243,7 +238,6 @@ function statusOf({ look, problem }, isLooking) {
 
 /**
  * The photograph upright and small, with the circles over it.
- *
  * @param {{file: File, look: any | null}} props
  */
 function Thumb({ file, look }) {
@@ -252,7 +246,9 @@ function Thumb({ file, look }) {
   useEffect(() => {
     let made = /** @type {ImageBitmap | null} */ (null);
     let isGone = false;
-    thumbOf(file).then((found) => {
+    readShown(file, THUMB_PX, (shown) =>
+      createImageBitmap(shown, { resizeWidth: THUMB_PX, resizeQuality: "medium" }).catch(() => null),
+    ).then((found) => {
       made = found;
       if (isGone) found?.close();
       else setBitmap(found);
@@ -267,16 +263,6 @@ function Thumb({ file, look }) {
   }, [bitmap, look]);
   const words = look?.found ? `${file.name} with ${look.circles.length} circles found` : file.name;
   return html`<canvas ref=${canvas} role="img" aria-label=${words}></canvas>`;
-}
-
-/** @param {File} file @returns {Promise<ImageBitmap | null>} null where nobody can show it */
-async function thumbOf(file) {
-  const small = (/** @type {Blob} */ shown) =>
-    createImageBitmap(shown, { resizeWidth: THUMB_PX, resizeQuality: "medium" }).catch(() => null);
-  const found = await small(file);
-  if (found !== null) return found;
-  const preview = await previewOf(file, THUMB_PX);
-  return preview && small(preview);
 }
 
 /** @param {HTMLCanvasElement} canvas @param {ImageBitmap | null} bitmap @param {any | null} look */
@@ -301,7 +287,6 @@ function draw(canvas, bitmap, look) {
 
 /**
  * A place of the stored frame in the upright photograph.
- *
  * @param {number} x
  * @param {number} y
  * @param {{orientation: number, width_px: number, height_px: number}} look

@@ -1,6 +1,6 @@
 /** Files that are photographs, of which browsers do not show every kind. */
 
-import { Problem, getBlob } from "./api.js";
+import { getBlob } from "./api.js";
 
 export const PHOTOGRAPHS = "image/*,.heic,.heif,.dng,.cr2,.nef,.arw";
 
@@ -11,18 +11,16 @@ export function mediaTypeOf(file) {
 }
 
 /**
- * A photograph that the browser does not show, HEIC or raw, as the service reads it.
- *
+ * What `read` makes of a photograph, or of the service's JPEG of one that the browser does not show.
+ * @template T
  * @param {File} file
  * @param {number} longestPx
- * @returns {Promise<Blob | null>} a JPEG; null where the service cannot read it either
+ * @param {(shown: Blob) => Promise<T | null>} read
  */
-export async function previewOf(file, longestPx) {
-  const headers = { "Content-Type": mediaTypeOf(file) };
-  try {
-    return await getBlob(`photographs/preview?longest_px=${longestPx}`, { method: "POST", headers, body: file, asks: false });
-  } catch (error) {
-    if (error instanceof Problem) return null; // what is wrong is told where depth or circles are asked for
-    throw error;
-  }
+export async function readShown(file, longestPx, read) {
+  const found = await read(file);
+  if (found !== null) return found;
+  const about = { method: "POST", headers: { "Content-Type": mediaTypeOf(file) }, body: file, asks: false };
+  const preview = await getBlob(`photographs/preview?longest_px=${longestPx}`, about).catch(() => null);
+  return preview && read(preview);
 }

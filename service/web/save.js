@@ -1,6 +1,5 @@
 /**
  * Give a person a file, as a download.
- *
  * @param {Blob} blob
  * @param {string} name
  */

@@ -197,7 +197,6 @@ function Bitmap({ bitmap, name }) {
 
 /**
  * What is drawn on the picture; it is said in words beside it.
- *
  * @param {{
  *   size: {width: number, height: number},
  *   reading: Reading | null,
@@ -253,7 +252,6 @@ function Marks({ size, reading, marks, measured }) {
 
 /**
  * Words beside a place, inside the picture.
- *
  * @param {{left: number, top: number, isBelow: boolean, name: string, children?: any}} props
  */
 function Label({ left, top, isBelow, name, children }) {
@@ -265,7 +263,6 @@ function Label({ left, top, isBelow, name, children }) {
 
 /**
  * How wide to paint: as wide as the picture is shown, in the screen's pixels.
- *
  * @param {{current: HTMLElement | null}} stage
  * @param {{width: number, height: number}} size
  */

@@ -10,7 +10,6 @@ import { html, useEffect, useState } from "./vendor/preact.js";
 
 /**
  * What one look found: a problem in the place of what could not be had, null where nobody has looked yet.
- *
  * @typedef {object} Found
  * @property {any | Problem | null} ready
  * @property {any | Problem | null} model
@@ -91,7 +90,6 @@ export function StatusView({ shown, announce }) {
 
 /**
  * Look again. The first look may ask for a key, and what a key was refused is not asked for again with the same one.
- *
  * @param {Found} before
  * @param {AbortSignal} signal
  * @returns {Promise<Found>}
@@ -348,10 +346,7 @@ function Scores({ scores }) {
   `;
 }
 
-/**
- * @param {number | undefined} value
- * @param {string} score
- */
+/** @param {number | undefined} value @param {string} score */
 function figure(value, score) {
   // the best constant is exact where a picture has one distance only, and then says nothing
   if (value === undefined || (score === "constant_abs_rel" && value === 0)) return "–";
