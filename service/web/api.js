@@ -1,5 +1,6 @@
 /**
  * The service's API: requests that carry the API key, and every failure as a `Problem`.
+ *
  * Paths are relative to the page ("cameras"), so that it works behind a prefix.
  */
 
@@ -35,7 +36,10 @@ export class Problem extends Error {
   }
 }
 
-/** @param {unknown} error @returns {Problem} the error, if it is one; else it is thrown on */
+/**
+ * @param {unknown} error
+ * @returns {Problem} the error, if it is one; else it is thrown on
+ */
 export function problemOf(error) {
   if (error instanceof Problem) return error;
   throw error;
@@ -64,6 +68,7 @@ let asking = null;
 
 /**
  * The key, asked for once however many requests want it.
+ *
  * @param {string | null} reason
  */
 async function askedKey(reason) {
@@ -80,6 +85,7 @@ async function askedKey(reason) {
 
 /**
  * Send with the key, as often as the service refuses it and another is given.
+ *
  * @template {{status: number}} T
  * @param {(headers: Record<string, string>) => Promise<T>} send
  * @param {(answer: T) => Promise<Problem>} toProblem
@@ -154,6 +160,7 @@ export async function request(path, options = {}) {
 
 /**
  * An answer with its body, which may break off too.
+ *
  * @param {"json" | "blob" | "text"} kind
  * @param {string} path
  * @param {RequestOptions} [options]
@@ -209,6 +216,7 @@ export async function everyCamera() {
 
 /**
  * Send a body with progress.
+ *
  * @param {string} path
  * @param {RequestOptions & {onProgress?: (fraction: number | null) => void, responseType?: XMLHttpRequestResponseType}} [options]
  *   `onProgress` gets the part sent, 0 to 1, or null where it is unknown
@@ -261,6 +269,7 @@ function sendWithProgress(path, { method = "POST", headers = {}, body = null, si
 
 /**
  * Read server-sent events until the stream ends; EventSource cannot send a key.
+ *
  * @param {string} path
  * @param {{signal?: AbortSignal, onEvent: (event: {event: string, data: string}) => void}} options
  */
@@ -284,7 +293,10 @@ export async function events(path, { signal, onEvent }) {
   }
 }
 
-/** @param {string} block @param {(event: {event: string, data: string}) => void} onEvent */
+/**
+ * @param {string} block
+ * @param {(event: {event: string, data: string}) => void} onEvent
+ */
 function readEvent(block, onEvent) {
   /** @type {string[]} */
   const data = [];

@@ -13,6 +13,7 @@ import { html, render, useCallback, useEffect, useState } from "./vendor/preact.
 
 /**
  * What every view gets. Views stay mounted when another is in front, so that nothing is lost.
+ *
  * @typedef {object} ViewProps
  * @property {boolean} shown whether the view's tab is in front
  * @property {any[] | null} cameras as the API gives them, by name; null while they load

@@ -6,6 +6,7 @@ import { decimal, when } from "./numbers.js";
 import { Photographs, useLooks } from "./photo_step.js";
 import { ProblemBox } from "./problem_box.js";
 import { SHEET, SheetStep, isMeasured, patternOf } from "./sheet_step.js";
+import { Table } from "./table.js";
 import { TextField } from "./text_field.js";
 import { html, useEffect, useRef, useState } from "./vendor/preact.js";
 
@@ -204,43 +205,39 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
   `;
 }
 
-/** @param {{items: any[], open: string | null, onOpen: (id: string) => void}} props */
+/**
+ * @param {{items: any[], open: string | null, onOpen: (id: string) => void}} props
+ */
 function Recent({ items, open, onOpen }) {
   if (items.length === 0) return null;
   return html`
     <details class="card" open>
       <summary>Recent calibrations</summary>
-      <div class="table-scroll" tabindex="0" role="region" aria-label="Recent calibrations">
-        <table>
-          <thead>
-            <tr><th scope="col">Camera</th><th scope="col">Begun</th><th scope="col">State</th><th scope="col"></th></tr>
-          </thead>
-          <tbody>
-            ${items.map(
-              (one) => html`<tr key=${one.id}>
-                <th scope="row" class="file">${one.camera}</th>
-                <td>${when(one.created_at)}</td>
-                <td>
-                  <span class=${`badge ${TONES[one.state] ?? ""}`}>${one.state}</span>
-                  ${one.camera_revision !== null && html` <span class="hint">revision ${one.camera_revision}</span>`}
-                </td>
-                <td class="number">
-                  ${one.id !== open &&
-                  html`<button type="button" class="quiet" aria-label=${`Open the calibration of ${one.camera}, ${one.state}`} onClick=${() => onOpen(one.id)}>
-                    Open
-                  </button>`}
-                </td>
-              </tr>`,
-            )}
-          </tbody>
-        </table>
-      </div>
+      <${Table} label="Recent calibrations" head=${["Camera", "Begun", "State", ""]}>
+        ${items.map(
+          (one) => html`<tr key=${one.id}>
+            <th scope="row" class="file">${one.camera}</th>
+            <td>${when(one.created_at)}</td>
+            <td>
+              <span class=${`badge ${TONES[one.state] ?? ""}`}>${one.state}</span>
+              ${one.camera_revision !== null && html` <span class="hint">revision ${one.camera_revision}</span>`}
+            </td>
+            <td class="number">
+              ${one.id !== open &&
+              html`<button type="button" class="quiet" aria-label=${`Open the calibration of ${one.camera}, ${one.state}`} onClick=${() => onOpen(one.id)}>
+                Open
+              </button>`}
+            </td>
+          </tr>`,
+        )}
+      <//>
     </details>
   `;
 }
 
 /**
  * Follows a calibration until it has ended; a stream that breaks is opened again.
+ *
  * @param {any | null} job
  * @param {(job: any) => void} setJob
  * @param {(problem: Problem | null) => void} setProblem

@@ -4,7 +4,9 @@ import { Chart } from "./chart.js";
 import { short } from "./numbers.js";
 import { html } from "./vendor/preact.js";
 
-/** @param {{camera: any, points: any[] | null}} props `camera` as the API reads or previews it */
+/**
+ * @param {{camera: any, points: any[] | null}} props `camera` as the API reads or previews it
+ */
 export function CameraCurve({ camera, points }) {
   const { near, far } = camera.range_m;
   return html`

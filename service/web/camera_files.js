@@ -4,17 +4,23 @@ import { Problem, everyCamera, problemOf, sendJson, storeCamera } from "./api.js
 import { differences, specsOf } from "./camera_specs.js";
 import { counted } from "./numbers.js";
 import { save } from "./save.js";
+import { Table } from "./table.js";
 import { html, useEffect, useRef, useState } from "./vendor/preact.js";
 
 /** @typedef {{camera: any, name: string, does: "create" | "update" | "nothing" | "refuse" | "done", words: string, revision: number | null}} Step */
 
-/** @param {any[]} cameras @param {string} name of the file */
+/**
+ * @param {any[]} cameras
+ * @param {string} name of the file
+ */
 export function exportCameras(cameras, name) {
   const text = `${JSON.stringify({ cameras: cameras.map(specsOf) }, null, 2)}\n`;
   save(new Blob([text], { type: "application/json" }), `${name}.json`);
 }
 
-/** @param {{file: File, onClose: (stored: number) => void}} props */
+/**
+ * @param {{file: File, onClose: (stored: number) => void}} props
+ */
 export function ImportDialog({ file, onClose }) {
   const dialog = useRef(/** @type {HTMLDialogElement | null} */ (null));
   const [steps, setSteps] = useState(/** @type {Step[] | null} */ (null));
@@ -45,21 +51,14 @@ export function ImportDialog({ file, onClose }) {
         ${fault && html`<p class="fault" role="alert">${fault}</p>`}
         ${!fault && steps === null && html`<p role="status">Reading ${file.name} ...</p>`}
         ${steps &&
-        html`<div class="table-scroll" tabindex="0" role="region" aria-label="What the import does">
-          <table>
-            <thead>
-              <tr><th scope="col">Camera</th><th scope="col">What happens</th></tr>
-            </thead>
-            <tbody>
-              ${steps.map(
-                ({ name, does, words }) => html`<tr>
-                  <th scope="row">${name}</th>
-                  <td><span class=${`badge ${TONES[does]}`}>${LABELS[does]}</span> ${words}</td>
-                </tr>`,
-              )}
-            </tbody>
-          </table>
-        </div>`}
+        html`<${Table} label="What the import does" head=${["Camera", "What happens"]}>
+          ${steps.map(
+            ({ name, does, words }) => html`<tr>
+              <th scope="row">${name}</th>
+              <td><span class=${`badge ${TONES[does]}`}>${LABELS[does]}</span> ${words}</td>
+            </tr>`,
+          )}
+        <//>`}
         <div class="row">
           ${wanted.length > 0 &&
           html`<button type="button" class="primary" disabled=${isBusy} onClick=${carryOut}>
@@ -75,7 +74,10 @@ export function ImportDialog({ file, onClose }) {
 const LABELS = { create: "new", update: "changes", nothing: "the same", refuse: "refused", done: "stored" };
 const TONES = { create: "good", update: "warn", nothing: "", refuse: "bad", done: "good" };
 
-/** @param {File} file @returns {Promise<Step[]>} */
+/**
+ * @param {File} file
+ * @returns {Promise<Step[]>}
+ */
 async function planOf(file) {
   /** @type {any} */
   let content;

@@ -5,6 +5,7 @@ import { CameraCurve } from "./camera_curve.js";
 import { BLANK, bodyOf, differences, fieldsOf, missingOf } from "./camera_specs.js";
 import { PHOTOGRAPHS, mediaTypeOf } from "./photograph_files.js";
 import { ProblemBox } from "./problem_box.js";
+import { Table } from "./table.js";
 import { TextField } from "./text_field.js";
 import { html, useEffect, useRef, useState } from "./vendor/preact.js";
 
@@ -188,6 +189,7 @@ function Field({ path, label, value, kind = "decimal", hint, disabled = false, f
 
 /**
  * What somebody else stored while this was edited, and whose is to stay.
+ *
  * @param {{base: any, theirs: any, fields: Fields, onMine: () => void, onTheirs: () => void}} props
  */
 function Conflict({ base, theirs, fields, onMine, onTheirs }) {
@@ -199,23 +201,16 @@ function Conflict({ base, theirs, fields, onMine, onTheirs }) {
         revision ${theirs.revision}. Nothing of yours is stored yet.
       </p>
       ${changed.length > 0
-        ? html`<div class="table-scroll" tabindex="0" role="region" aria-label="What changed">
-            <table>
-              <thead>
-                <tr><th scope="col">Field</th><th scope="col">You opened</th><th scope="col">Now stored</th><th scope="col">Yours</th></tr>
-              </thead>
-              <tbody>
-                ${changed.map(
-                  ({ path, before, after }) => html`<tr>
-                    <th scope="row">${path.replace("/", " ")}</th>
-                    <td>${before || "–"}</td>
-                    <td>${after || "–"}</td>
-                    <td>${fields[path] || "–"}</td>
-                  </tr>`,
-                )}
-              </tbody>
-            </table>
-          </div>`
+        ? html`<${Table} label="What changed" head=${["Field", "You opened", "Now stored", "Yours"]}>
+            ${changed.map(
+              ({ path, before, after }) => html`<tr>
+                <th scope="row">${path.replace("/", " ")}</th>
+                <td>${before || "–"}</td>
+                <td>${after || "–"}</td>
+                <td>${fields[path] || "–"}</td>
+              </tr>`,
+            )}
+          <//>`
         : html`<p>Its numbers are the same as those you opened.</p>`}
       <div class="row">
         <button type="button" onClick=${onMine}>Store mine as revision ${theirs.revision + 1}</button>
@@ -227,6 +222,7 @@ function Conflict({ base, theirs, fields, onMine, onTheirs }) {
 
 /**
  * The service's answer to the fields, a moment after the last change.
+ *
  * @param {Fields} fields
  * @returns {{preview: any | null, faults: import("./api.js").FieldProblem[]}}
  */

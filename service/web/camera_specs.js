@@ -23,6 +23,7 @@ export const BLANK = { "by": "lens", "gamma_px": "0.5", "lens/k_r": "4" };
 
 /**
  * What `POST /cameras` takes, of a camera that the API answered.
+ *
  * @param {any} camera
  */
 export function specsOf(camera) {
@@ -32,7 +33,10 @@ export function specsOf(camera) {
   return { name, description, image_width_px, image_height_px, focus_distance_m, ...blur, gamma_px, intrinsics };
 }
 
-/** @param {any} camera as the API answers or takes it; what is null stays empty @returns {Fields} */
+/**
+ * @param {any} camera as the API answers or takes it; what is null stays empty
+ * @returns {Fields}
+ */
 export function fieldsOf(camera) {
   /** @type {Fields} */
   const fields = { ...BLANK, by: camera.lens ? "lens" : "k_cam" };
@@ -50,7 +54,10 @@ export function fieldsOf(camera) {
   return fields;
 }
 
-/** @param {Fields} fields @returns {any} the body for the API, which says itself what is no number */
+/**
+ * @param {Fields} fields
+ * @returns {any} the body for the API, which says itself what is no number
+ */
 export function bodyOf(fields) {
   const text = (/** @type {string} */ path) => (fields[path] ?? "").trim();
   const number = (/** @type {string} */ path) => toNumber(text(path));
@@ -82,6 +89,7 @@ export function missingOf(fields) {
 
 /**
  * What differs between two cameras, field by field.
+ *
  * @param {any} before
  * @param {any} after
  * @returns {{path: string, before: string, after: string}[]}

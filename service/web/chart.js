@@ -16,6 +16,7 @@ const MOST_ROWS = 30;
 
 /**
  * `line` and `dots` draw the points, `band` what is between their `low` and `high`.
+ *
  * @typedef {{name: string, kind: "line" | "band" | "dots", tone: string, points: Point[]}} Series
  */
 
@@ -148,28 +149,19 @@ function drawn({ kind, tone, points }, across, up) {
  */
 function tabled({ name, kind, points }, x, y) {
   const every = Math.ceil(points.length / MOST_ROWS);
+  const rows = points.filter((_, number) => number % every === 0);
   const isBand = kind === "band";
+  const head = [x.label, ...(isBand ? ["Low", "High"] : [y.label])];
   return html`<table>
     ${name && html`<caption>${name}</caption>`}
     <thead>
-      <tr>
-        <th scope="col" class="number">${x.label} (${x.unit})</th>
-        ${isBand
-          ? html`<th scope="col" class="number">Low (${y.unit})</th><th scope="col" class="number">High (${y.unit})</th>`
-          : html`<th scope="col" class="number">${y.label} (${y.unit})</th>`}
-      </tr>
+      <tr>${head.map((words, at) => html`<th scope="col" class="number">${words} (${at ? y.unit : x.unit})</th>`)}</tr>
     </thead>
     <tbody>
-      ${points
-        .filter((_, number) => number % every === 0)
-        .map(
-          (point) => html`<tr>
-            <td class="number">${short(point.x)}</td>
-            ${isBand
-              ? html`<td class="number">${short(point.low)}</td><td class="number">${short(point.high)}</td>`
-              : html`<td class="number">${short(point.y)}</td>`}
-          </tr>`,
-        )}
+      ${rows.map((point) => {
+        const numbers = isBand ? [point.x, point.low, point.high] : [point.x, point.y];
+        return html`<tr>${numbers.map((number) => html`<td class="number">${short(number)}</td>`)}</tr>`;
+      })}
     </tbody>
   </table>`;
 }

@@ -79,7 +79,10 @@ export class Cloud {
     this.buffers = [gl.createBuffer(), gl.createBuffer()];
   }
 
-  /** @param {number} width of the picture in the screen's pixels @param {number} height */
+  /**
+   * @param {number} width of the picture in the screen's pixels
+   * @param {number} height
+   */
   resize(width, height) {
     Object.assign(this.canvas, { width, height });
     this.drawSoon();
@@ -106,7 +109,10 @@ export class Cloud {
     gl.vertexAttribPointer(place, 3, kind, true, 0, 0);
   }
 
-  /** @param {number} right of the picture's height @param {number} down */
+  /**
+   * @param {number} right of the picture's height
+   * @param {number} down
+   */
   orbit(right, down) {
     this.view.yaw += right * Math.PI;
     this.view.pitch = Math.min(STEEPEST, Math.max(-STEEPEST, this.view.pitch + down * Math.PI));
@@ -147,6 +153,7 @@ export class Cloud {
 
   /**
    * From metres (x right, y down, z forward) to clip space (y up, z towards the viewer), column by column.
+   *
    * @param {number[]} centre
    * @param {number} aspect
    */

@@ -109,6 +109,7 @@ function drawOn(canvas, onMissing) {
 
 /**
  * Size, pointers, wheel and keys for the view.
+ *
  * @param {HTMLCanvasElement} canvas
  * @param {Tell} tell
  * @returns {() => void} what ends it

@@ -19,7 +19,10 @@ export const MAPS = [
   ["grey", "Grey"],
 ];
 
-/** @param {MapName} name @returns {Uint8ClampedArray} 256 times red, green, blue */
+/**
+ * @param {MapName} name
+ * @returns {Uint8ClampedArray} 256 times red, green, blue
+ */
 export function colourTable(name) {
   const stops = (STOPS[name].match(/../g) ?? []).map((digits) => parseInt(digits, 16));
   const last = stops.length / 3 - 1;
@@ -37,6 +40,7 @@ export function colourTable(name) {
 
 /**
  * The place of a depth between two others, on a logarithm: an error of blur is a share of the depth.
+ *
  * @param {number} depthM
  * @param {number} nearM
  * @param {number} farM

@@ -19,7 +19,10 @@ export const FORMATS = {
   json: { ending: "json", says: "JSON, summary" },
 };
 
-/** @param {Ask} ask @returns {string} path and query, relative to the page */
+/**
+ * @param {Ask} ask
+ * @returns {string} path and query, relative to the page
+ */
 export function depthPath({ camera, side, focusM, format }) {
   const query = new URLSearchParams({ camera });
   if (side !== "auto") query.set("side", side);
@@ -28,7 +31,10 @@ export function depthPath({ camera, side, focusM, format }) {
   return `depth?${query}`;
 }
 
-/** @param {string} photograph the file's name @param {string} format */
+/**
+ * @param {string} photograph the file's name
+ * @param {string} format
+ */
 export function answerName(photograph, format) {
   return `${photograph.replace(/\.[^.]*$/, "") || "photograph"}-depth.${FORMATS[format].ending}`;
 }

@@ -117,7 +117,10 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
     return () => abort.abort();
   }, [file, camera?.name, camera?.revision, side, focusM, attempt]);
 
-  /** @param {File} sent @param {AbortSignal} signal */
+  /**
+   * @param {File} sent
+   * @param {AbortSignal} signal
+   */
   async function run(sent, signal) {
     const show = (/** @type {Phase | null} */ next) => signal.aborted || setPhase(next);
     setProblem(null);
@@ -293,6 +296,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 
 /**
  * Photographs that are dropped anywhere on the view, or pasted.
+ *
  * @param {boolean} shown
  * @param {(file: File | null | undefined) => void} take
  */
@@ -445,7 +449,10 @@ function Warnings({ texts }) {
   </ul>`;
 }
 
-/** @param {string} text @returns {"camera" | "focus" | "result"} beside what it should be read */
+/**
+ * @param {string} text
+ * @returns {"camera" | "focus" | "result"} beside what it should be read
+ */
 function placeOfWarning(text) {
   if (text.includes("focal length")) return "focus";
   return text.includes("k_cam_px") ? "camera" : "result";
@@ -458,7 +465,10 @@ function about({ image_width_px, image_height_px, focus_distance_m, range_m, des
   return description ? `${description}. ${numbers}` : numbers;
 }
 
-/** @param {string} header `decode;dur=1.2, wait;dur=0.1` @returns {[string, number][]} */
+/**
+ * @param {string} header `decode;dur=1.2, wait;dur=0.1`
+ * @returns {[string, number][]}
+ */
 function readTimings(header) {
   return Array.from(header.matchAll(/([\w-]+);dur=([\d.]+)/g), ([, stage, ms]) => [stage, Number(ms)]);
 }

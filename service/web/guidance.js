@@ -28,6 +28,7 @@ const FARTHER = [1.25, 1.7];
 
 /**
  * How many circles were in each part of the frame.
+ *
  * @param {Seen[]} seen
  * @returns {number[][]} rows of columns
  */
@@ -43,6 +44,7 @@ export function coverageOf(seen) {
 
 /**
  * Where the lens seems to be focused: as told, else the distance of the sharpest photograph.
+ *
  * @param {Seen[]} seen
  * @param {number | null} told
  */
@@ -105,7 +107,10 @@ function sizeOf({ circles, width }) {
   return Math.hypot(Math.max(...across) - Math.min(...across), Math.max(...down) - Math.min(...down)) / width;
 }
 
-/** @param {number[][]} cells @returns {string | null} the first corner without a circle */
+/**
+ * @param {number[][]} cells
+ * @returns {string | null} the first corner without a circle
+ */
 function missingCorner(cells) {
   const [top, bottom] = [cells[0], cells[ROWS - 1]];
   const corners = /** @type {[string, number[], number[]][]} */ ([

@@ -4,6 +4,7 @@ import { Problem, problemOf, request, sendJson } from "./api.js";
 import { Chart } from "./chart.js";
 import { counted, measure, short } from "./numbers.js";
 import { ProblemBox } from "./problem_box.js";
+import { Table } from "./table.js";
 import { html, useEffect, useState } from "./vendor/preact.js";
 
 const MOST_OUTLIERS = 50;
@@ -45,30 +46,19 @@ export function Running({ job }) {
 function Images({ images }) {
   if (images.length === 0) return null;
   return html`
-    <div class="table-scroll" tabindex="0" role="region" aria-label="Photographs">
-      <table>
-        <thead>
-          <tr>
-            <th scope="col">Photograph</th><th scope="col">Grid</th><th scope="col" class="number">Circles</th>
-            <th scope="col" class="number">Blur</th><th scope="col" class="number">Distance</th><th scope="col" class="number">Tilt</th>
-            <th scope="col">Remarks</th>
-          </tr>
-        </thead>
-        <tbody>
-          ${images.map(
-            (one) => html`<tr key=${one.name}>
-              <th scope="row" class="file" title=${ROLES[/** @type {keyof typeof ROLES} */ (one.role)]}>${one.name}</th>
-              <td><span class=${`badge ${one.found ? "good" : "bad"}`}>${one.found ? "found" : "not found"}</span></td>
-              <td class="number">${one.circles}</td>
-              <td class="number">${measure(one.blur_px, " px")}</td>
-              <td class="number">${measure(one.distance_m, " m")}</td>
-              <td class="number">${measure(one.tilt_deg, "°", 2)}</td>
-              <td class="hint">${one.warnings.join("; ")}</td>
-            </tr>`,
-          )}
-        </tbody>
-      </table>
-    </div>
+    <${Table} label="Photographs" head=${["Photograph", "Grid", "Circles", "Blur", "Distance", "Tilt", "Remarks"]} numbers=${[2, 3, 4, 5]}>
+      ${images.map(
+        (one) => html`<tr key=${one.name}>
+          <th scope="row" class="file" title=${ROLES[/** @type {keyof typeof ROLES} */ (one.role)]}>${one.name}</th>
+          <td><span class=${`badge ${one.found ? "good" : "bad"}`}>${one.found ? "found" : "not found"}</span></td>
+          <td class="number">${one.circles}</td>
+          <td class="number">${measure(one.blur_px, " px")}</td>
+          <td class="number">${measure(one.distance_m, " m")}</td>
+          <td class="number">${measure(one.tilt_deg, "°", 2)}</td>
+          <td class="hint">${one.warnings.join("; ")}</td>
+        </tr>`,
+      )}
+    <//>
   `;
 }
 
@@ -191,6 +181,7 @@ function Residuals({ result: { samples, curve } }) {
 
 /**
  * The service's curve between two of its points.
+ *
  * @param {any[]} curve
  * @param {number} depth
  * @returns {number | null}
@@ -207,27 +198,17 @@ function curveAt(curve, depth) {
 function Outliers({ outliers }) {
   if (outliers.length === 0) return html`<p class="hint">Every circle fits.</p>`;
   return html`
-    <div class="table-scroll" tabindex="0" role="region" aria-label="Outliers">
-      <table>
-        <thead>
-          <tr>
-            <th scope="col">Photograph</th><th scope="col" class="number">Circle</th><th scope="col" class="number">At u, v (px)</th>
-            <th scope="col" class="number">Distance (m)</th><th scope="col" class="number">Blur (px)</th>
-          </tr>
-        </thead>
-        <tbody>
-          ${outliers.slice(0, MOST_OUTLIERS).map(
-            (one) => html`<tr>
-              <th scope="row" class="file">${one.image}</th>
-              <td class="number">${one.circle}</td>
-              <td class="number">${Math.round(one.u_px)}, ${Math.round(one.v_px)}</td>
-              <td class="number">${short(one.depth_m)}</td>
-              <td class="number">${short(one.blur_px)}</td>
-            </tr>`,
-          )}
-        </tbody>
-      </table>
-    </div>
+    <${Table} label="Outliers" head=${["Photograph", "Circle", "At u, v (px)", "Distance (m)", "Blur (px)"]} numbers=${[1, 2, 3, 4]}>
+      ${outliers.slice(0, MOST_OUTLIERS).map(
+        (one) => html`<tr>
+          <th scope="row" class="file">${one.image}</th>
+          <td class="number">${one.circle}</td>
+          <td class="number">${Math.round(one.u_px)}, ${Math.round(one.v_px)}</td>
+          <td class="number">${short(one.depth_m)}</td>
+          <td class="number">${short(one.blur_px)}</td>
+        </tr>`,
+      )}
+    <//>
     ${outliers.length > MOST_OUTLIERS && html`<p class="hint">and ${outliers.length - MOST_OUTLIERS} more</p>`}
   `;
 }

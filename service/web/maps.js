@@ -7,6 +7,7 @@ import { readNpz } from "./npy.js";
 
 /**
  * What is known at a pixel; null where there is no answer, or no other hypothesis.
+ *
  * @typedef {object} Reading
  * @property {number} u
  * @property {number} v
@@ -125,6 +126,7 @@ export class DepthMaps {
 
   /**
    * The distance in space between two pixels' points, with the error that both depths' errors give it.
+   *
    * @param {{u: number, v: number}} from
    * @param {{u: number, v: number}} to
    * @returns {{distanceM: number, sigmaM: number} | null} null without a focal length, or where one has no answer
@@ -197,6 +199,7 @@ export class DepthMaps {
 
   /**
    * Points of evenly spaced pixels, x right, y down, z forward, in metres.
+   *
    * @param {number} most
    * @param {Look} look
    * @param {ImageData | null} photograph whose colours the points get; null: those of their depths
@@ -241,7 +244,10 @@ export class DepthMaps {
   }
 }
 
-/** @param {number[]} one @param {number[]} other */
+/**
+ * @param {number[]} one
+ * @param {number[]} other
+ */
 function dot(one, other) {
   return one.reduce((sum, part, axis) => sum + part * other[axis], 0);
 }

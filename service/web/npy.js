@@ -12,6 +12,7 @@ const KINDS = { "<f4": Float32Array, "<f8": Float64Array, "|b1": Uint8Array, "|u
 
 /**
  * Only one array is in memory twice at a time, and the zip itself never.
+ *
  * @param {Blob} file
  * @returns {Promise<Map<string, NumpyArray>>} arrays by their names
  */
@@ -43,7 +44,10 @@ async function readEntry(file, header, bytes) {
   return readNpy(await file.slice(start, start + bytes).arrayBuffer());
 }
 
-/** @param {ArrayBuffer} buffer @returns {NumpyArray} */
+/**
+ * @param {ArrayBuffer} buffer
+ * @returns {NumpyArray}
+ */
 function readNpy(buffer) {
   const view = new DataView(buffer);
   if (textOf(view, 1, 5) !== "NUMPY") throw new Error("This is no npy.");

@@ -14,6 +14,7 @@ const EXPOSURES = { good: "good", over: "too bright", under: "too dark" };
 
 /**
  * `asked` is what the look, or the problem, answers: another pattern or camera asks anew.
+ *
  * @typedef {{id: number, file: File, role: Role, asked: string, look: any | null, problem: Problem | null}} Photo
  */
 
@@ -44,6 +45,7 @@ function photosOf(files, role) {
 
 /**
  * Looks at one photograph after the other, whenever there is one that was not.
+ *
  * @param {Photo[]} photos
  * @param {(change: (before: Photo[]) => Photo[]) => void} setPhotos
  * @param {string} query the pattern and camera
@@ -139,6 +141,7 @@ function seenOf({ role, look }) {
 
 /**
  * Whether a defocused photograph has a focused one to tell where its circles are.
+ *
  * @param {Photo} photo
  * @param {Photo[]} photos
  */
@@ -147,7 +150,9 @@ function hasPartner(photo, photos) {
   return place >= 0 && Boolean(photos.filter(({ role }) => role === "focused")[place]?.look?.found);
 }
 
-/** @param {{role: Role, title: string, words: string, onFiles: (files: File[]) => void}} props */
+/**
+ * @param {{role: Role, title: string, words: string, onFiles: (files: File[]) => void}} props
+ */
 function DropZone({ role, title, words, onFiles }) {
   const input = useRef(/** @type {HTMLInputElement | null} */ (null));
   const [isOver, setIsOver] = useState(false);
@@ -238,6 +243,7 @@ function statusOf({ look, problem }, isLooking) {
 
 /**
  * The photograph upright and small, with the circles over it.
+ *
  * @param {{file: File, look: any | null}} props
  */
 function Thumb({ file, look }) {
@@ -287,6 +293,7 @@ function draw(canvas, bitmap, look) {
 
 /**
  * A place of the stored frame in the upright photograph.
+ *
  * @param {number} x
  * @param {number} y
  * @param {{orientation: number, width_px: number, height_px: number}} look

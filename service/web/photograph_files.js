@@ -12,6 +12,7 @@ export function mediaTypeOf(file) {
 
 /**
  * What `read` makes of a photograph, or of the service's JPEG of one that the browser does not show.
+ *
  * @template T
  * @param {File} file
  * @param {number} longestPx

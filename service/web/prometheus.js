@@ -2,7 +2,10 @@
 
 /** @typedef {{name: string, labels: Record<string, string>, value: number}} Sample */
 
-/** @param {string} text @returns {Sample[]} */
+/**
+ * @param {string} text
+ * @returns {Sample[]}
+ */
 export function readSamples(text) {
   return [...text.matchAll(/^(\w+)(?:\{(.*)\})? (\S+)$/gm)].map(([, name, labels = "", value]) => ({
     name,

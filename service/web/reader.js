@@ -41,6 +41,7 @@ export class DepthReader {
 
 /**
  * Calls one at a time, and of those that come meanwhile only the last.
+ *
  * @template T
  * @param {(wanted: T) => Promise<void>} work
  * @returns {(wanted: T) => void}

@@ -2,7 +2,10 @@
 
 import { html } from "./vendor/preact.js";
 
-/** @param {number} value @param {number} [digits] of its decimals; a millimetre by default */
+/**
+ * @param {number} value
+ * @param {number} [digits] of its decimals; a millimetre by default
+ */
 export function metres(value, digits = 3) {
   return `${value.toFixed(digits)} m`;
 }
@@ -88,7 +91,10 @@ export function Timings({ timings, model }) {
   </details>`;
 }
 
-/** @param {Reading} reading @returns {[string, number]} the side that the answer is on, and how likely that is */
+/**
+ * @param {Reading} reading
+ * @returns {[string, number]} the side that the answer is on, and how likely that is
+ */
 function sideOf({ depthM, otherM, pNear }) {
   const isNear = depthM !== null && otherM !== null ? depthM < otherM : pNear >= 0.5;
   return isNear ? ["nearer than focus", pNear] : ["beyond focus", 1 - pNear];

@@ -1,5 +1,6 @@
 /**
  * Give a person a file, as a download.
+ *
  * @param {Blob} blob
  * @param {string} name
  */

@@ -12,6 +12,7 @@ const RULER_MM = 100;
 
 /**
  * The sheet as it is printed, numbers as they are typed; `ruler_mm` is what the printed ruler of 100 mm measures.
+ *
  * @typedef {{kind: string, rows: string, columns: string, spacing_mm: string, diameter_mm: string, paper: string, ruler_mm: string}} Sheet
  */
 
@@ -28,6 +29,7 @@ export const SHEET = {
 
 /**
  * The pattern as it came out of the printer.
+ *
  * @param {Sheet} sheet
  * @returns {{kind: string, rows: number, columns: number, spacing_mm: number, diameter_mm: number}}
  */
@@ -48,7 +50,9 @@ export function isMeasured({ ruler_mm }) {
   return decimal(ruler_mm) >= 50 && decimal(ruler_mm) <= 200;
 }
 
-/** @param {{sheet: Sheet, onChange: (sheet: Sheet) => void, onNext: () => void}} props */
+/**
+ * @param {{sheet: Sheet, onChange: (sheet: Sheet) => void, onNext: () => void}} props
+ */
 export function SheetStep({ sheet, onChange, onNext }) {
   const { picture, problem } = usePicture(sheet);
   const [failed, setFailed] = useState(/** @type {Problem | null} */ (null));

@@ -197,6 +197,7 @@ function Bitmap({ bitmap, name }) {
 
 /**
  * What is drawn on the picture; it is said in words beside it.
+ *
  * @param {{
  *   size: {width: number, height: number},
  *   reading: Reading | null,
@@ -252,6 +253,7 @@ function Marks({ size, reading, marks, measured }) {
 
 /**
  * Words beside a place, inside the picture.
+ *
  * @param {{left: number, top: number, isBelow: boolean, name: string, children?: any}} props
  */
 function Label({ left, top, isBelow, name, children }) {
@@ -263,6 +265,7 @@ function Label({ left, top, isBelow, name, children }) {
 
 /**
  * How wide to paint: as wide as the picture is shown, in the screen's pixels.
+ *
  * @param {{current: HTMLElement | null}} stage
  * @param {{width: number, height: number}} size
  */

@@ -4,12 +4,14 @@ import { Problem, getBlob, getJson, getText, problemOf, storedKey } from "./api.
 import { ProblemBox } from "./problem_box.js";
 import { histogramOf, readSamples, valueOf } from "./prometheus.js";
 import { save } from "./save.js";
+import { Table } from "./table.js";
 import { html, useEffect, useState } from "./vendor/preact.js";
 
 /** @typedef {import("./prometheus.js").Sample} Sample */
 
 /**
  * What one look found: a problem in the place of what could not be had, null where nobody has looked yet.
+ *
  * @typedef {object} Found
  * @property {any | Problem | null} ready
  * @property {any | Problem | null} model
@@ -90,6 +92,7 @@ export function StatusView({ shown, announce }) {
 
 /**
  * Look again. The first look may ask for a key, and what a key was refused is not asked for again with the same one.
+ *
  * @param {Found} before
  * @param {AbortSignal} signal
  * @returns {Promise<Found>}
@@ -299,7 +302,7 @@ function ModelFacts({ manifest, card }) {
       pixels of the image as the model reads it. Beyond them the service warns, and beyond those of blur and depth it gives
       no answer.
     </p>
-    <dl class="ranges">
+    <dl class="figures">
       ${Object.entries(RANGES).map(
         ([name, title]) =>
           manifest.ranges[name] &&
@@ -319,25 +322,15 @@ function Scores({ scores }) {
   const sets = [...new Set(Object.keys(scores).map((key) => key.slice(0, key.lastIndexOf("."))))];
   if (sets.length === 0) return html`<p>This model comes without scores.</p>`;
   return html`
-    <div class="table-scroll scores" tabindex="0" role="region" aria-labelledby="scores-title">
-      <table>
-        <caption id="scores-title">Scores on ${sets.length} sets of pictures that no training saw</caption>
-        <thead>
-          <tr>
-            <th scope="col">Set</th>
-            ${SCORES.map(([, title]) => html`<th scope="col" class="number">${title}</th>`)}
-          </tr>
-        </thead>
-        <tbody>
-          ${sets.map(
-            (set) => html`<tr key=${set}>
-              <th scope="row">${set}</th>
-              ${SCORES.map(([score]) => html`<td class="number">${figure(scores[`${set}.${score}`], score)}</td>`)}
-            </tr>`,
-          )}
-        </tbody>
-      </table>
-    </div>
+    <h4>Scores on ${sets.length} sets of pictures that no training saw</h4>
+    <${Table} label="Scores" head=${["Set", ...SCORES.map(([, title]) => title)]} numbers=${[1, 2, 3, 4]}>
+      ${sets.map(
+        (set) => html`<tr key=${set}>
+          <th scope="row">${set}</th>
+          ${SCORES.map(([score]) => html`<td class="number">${figure(scores[`${set}.${score}`], score)}</td>`)}
+        </tr>`,
+      )}
+    <//>
     <p class="hint">
       AbsRel is the mean error as a part of the distance; half of the pixels are off by less than the median error. The best
       constant is the AbsRel of the best single distance for each picture: a model that reads depth beats it. RMSE is the root of
@@ -346,7 +339,10 @@ function Scores({ scores }) {
   `;
 }
 
-/** @param {number | undefined} value @param {string} score */
+/**
+ * @param {number | undefined} value
+ * @param {string} score
+ */
 function figure(value, score) {
   // the best constant is exact where a picture has one distance only, and then says nothing
   if (value === undefined || (score === "constant_abs_rel" && value === 0)) return "–";

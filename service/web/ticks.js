@@ -2,7 +2,10 @@
 
 const MOST = 7;
 
-/** @param {number} low @param {number} high */
+/**
+ * @param {number} low
+ * @param {number} high
+ */
 export function ticksOf(low, high) {
   const raw = (high - low) / (MOST - 1);
   const power = 10 ** Math.floor(Math.log10(raw));
@@ -12,7 +15,10 @@ export function ticksOf(low, high) {
   return ticks;
 }
 
-/** @param {number} low @param {number} high */
+/**
+ * @param {number} low
+ * @param {number} high
+ */
 export function logTicks(low, high) {
   const ticks = [];
   const factors = high / low > 100 ? [1] : [1, 2, 5];
