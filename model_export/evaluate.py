@@ -19,8 +19,9 @@ from model_export.cores import torch_threads
 from model_export.metrics import Scores, best_constant, completed, mean_scores, pooled_scores, score
 from service.inference.artifact import ModelFolder, load_model_folder
 from service.inference.cancellation import Cancellation
-from service.inference.depth_map import SIGMA_OF_LAPLACE, DepthMap
+from service.inference.depth_map import DepthMap
 from service.inference.estimator import Estimator
+from service.inference.hypotheses import SIGMA_OF_LAPLACE
 from service.inference.pair import GraphPair, RawMaps, Stopwatch
 from service.optics import thin_lens
 from service.optics.camera import Camera

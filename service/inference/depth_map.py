@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.inference.artifact import Manifest
+from service.inference.hypotheses import SIGMA_OF_LAPLACE, merged
 from service.inference.pair import RawMaps, Side
 from service.inference.part import Part
 from service.inference.resampling import Ratio, bands, sample
@@ -17,9 +18,7 @@ from service.optics.camera import Camera
 
 MAX_RELATIVE_ERROR = 1.0
 NO_ANSWER = np.float32(1e3)  # a relative error that no reading states
-LEAST_P_NEAR = np.float32(0.35)
 LEAST_BLUR_ERROR_PX = 0.05  # nobody reads blur better: no stated error is below what it does to depth
-SIGMA_OF_LAPLACE = np.float32(2**0.5)
 
 Array = NDArray[np.float32]
 
@@ -96,8 +95,7 @@ class Layers:
 
     def hide_unanswered(self) -> NDArray[np.bool_]:
         """Which pixels have an answer; NaN goes where there is none."""
-        with np.errstate(invalid="ignore"):
-            valid = (self.sigma_m <= MAX_RELATIVE_ERROR * self.depth_m) & np.isfinite(self.depth_m)
+        valid = np.isfinite(self.sigma_m)
         if not valid.all():
             for hidden in (self.depth_m, self.depth_alt_m, self.sigma_m):
                 hidden[~valid] = np.nan
@@ -200,33 +198,27 @@ def _sampled(reading: Reading, rows: slice, width: int) -> Layers:
     return Layers(*(sample(values, reading.ratio, rows, width) for values in maps))
 
 
-def _near_from(near_m: Array, far_m: Array) -> Array:
-    """The probability of near from which near is the answer: above it, its relative error is the lesser on average.
-
-    Far for what is near is off by far / near - 1, near for what is far by 1 - near / far, which is never as much. It is
-    not below ``LEAST_P_NEAR``, for the network's probabilities are not that exact.
-    """
-    return np.maximum(near_m / (near_m + far_m), LEAST_P_NEAR)
-
-
 def _told(layers: Layers, reading: Reading, side: Side) -> Layers:
-    """The layers with depth where it is, ``sigma_m`` relative yet.
+    """The layers with depth where it is, ``sigma_m`` relative yet and infinite where there is no answer.
 
-    The side is the one that is off by less, unless it is given; where no far answer can exist it is near, always. No
-    error is stated below the floor of optics.
+    Depth and error are those of both hypotheses together, unless the side is given; where no far answer can exist it is
+    near, always. No error is stated below the floor of optics.
     """
     near_m, far_m, p_near, error = layers.depth_m, layers.depth_alt_m, layers.p_near, layers.sigma_m
     if side != "auto":
         p_near.fill(side == "near")
-    np.copyto(p_near, 1, where=np.isnan(far_m))
-    is_far = p_near < _near_from(near_m, far_m)
-    depth_m = np.where(is_far, far_m, near_m)
+    has_no_far = np.isnan(far_m)
+    np.copyto(p_near, 1, where=has_no_far)
+    depth_m, merged_error, is_far = merged(near_m, np.where(has_no_far, near_m, far_m), p_near, error)
     np.copyto(far_m, near_m, where=is_far)
     near_m[:] = depth_m
     camera = reading.camera
     floor = thin_lens.depth_error(1.0, camera.focus_distance_m, camera.k_cam_px, LEAST_BLUR_ERROR_PX)
-    np.fmax(error, np.float32(floor) * depth_m, out=error)
+    least_error = np.float32(floor) * depth_m
     nearest_m, farthest_m = reading.trained_m
-    error[(depth_m < nearest_m) | (depth_m > farthest_m)] = NO_ANSWER
+    is_unknown = (error > MAX_RELATIVE_ERROR) | (least_error > MAX_RELATIVE_ERROR)
+    is_unknown |= (depth_m < nearest_m) | (depth_m > farthest_m)
+    np.fmax(merged_error, least_error, out=error)
+    error[is_unknown] = np.inf
     np.divide(layers.blur_px, np.float32(reading.scale), out=layers.blur_px)
     return layers

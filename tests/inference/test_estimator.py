@@ -112,7 +112,7 @@ def test_blur_no_surer_than_that_may_lie_beyond_focus_all_the_same(
 def test_the_side_is_the_one_that_is_off_by_less_on_average(
     folder: Path, near_m: float, far_m: float, p_near: float, is_near: bool
 ) -> None:
-    values = dict.fromkeys(MAPS, 0.0) | {"blur_px": 2.0, "blur_log_error": -3.0, "p_near": p_near, "log_scale": -3.0}
+    values = dict.fromkeys(MAPS, 0.0) | {"blur_px": 2.0, "blur_log_error": -3.0, "p_near": p_near, "log_scale": -12.0}
     values |= {"log_ratio_near": np.log(near_m / 2), "log_ratio_far": np.log(far_m / 2)}
     maps = {name: np.full((32, 48), value, np.float32) for name, value in values.items()}
     reading = Reading.of(maps, CAMERA, (64, 96), load_model_folder(folder).manifest)

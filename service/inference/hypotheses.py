@@ -1,0 +1,36 @@
+"""One depth from the two that a blur fits: each is a Laplace law in ln z, and the truth follows one of them."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+SIGMA_OF_LAPLACE = np.float32(2**0.5)
+LEAST_P_NEAR = 0.35
+
+Array = NDArray[np.float32]
+
+
+def merged(near_m: Array, far_m: Array, p_near: Array, error: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Depth in metres, its relative standard deviation, and where the far hypothesis is the likelier; all of one shape.
+
+    ``error`` is the relative standard deviation of either hypothesis, above 0; near is not beyond far. Depth is the
+    median of both laws together: one hypothesis where its probability or their distance leaves no doubt, drawn towards
+    the other where there is some, half way where neither is likelier. Its deviation is that from both laws.
+
+    For the median a near truth counts far / near times as much, for that is how much more a wrong answer is off there,
+    relatively; but no more than leaves far the likelier below ``LEAST_P_NEAR``: the network's probabilities are not
+    that exact.
+    """
+    ratio = far_m / near_m
+    odds = p_near * np.minimum(ratio, (1 - LEAST_P_NEAR) / LEAST_P_NEAR)
+    lean = (odds - (1 - p_near)) / (odds + (1 - p_near))
+    doubt, side = 1 - lean**2, np.copysign(np.float32(1), lean)
+    half_gap = np.log(ratio) / 2
+    scale = error / SIGMA_OF_LAPLACE
+    # between the peaks the median solves a quadratic equation in exp(pull / scale)
+    np.abs(lean, out=lean)
+    root = np.sqrt(lean**2 + doubt * np.exp(-2 * half_gap / scale))
+    pull = scale * np.log((1 + lean) / np.maximum(lean + root, np.finfo(np.float32).tiny))
+    probability = 0.5 + side * (p_near - 0.5)
+    deviation = np.sqrt(error**2 + probability * pull**2 + (1 - probability) * (2 * half_gap - pull) ** 2)
+    depth_m = near_m * np.exp(half_gap - side * (half_gap - pull))
+    return depth_m, deviation, side < 0
