@@ -218,7 +218,7 @@ def _told(layers: Layers, reading: Reading, side: Side) -> Layers:
     nearest_m, farthest_m = reading.trained_m
     is_unknown = (error > MAX_RELATIVE_ERROR) | (least_error > MAX_RELATIVE_ERROR)
     is_unknown |= (depth_m < nearest_m) | (depth_m > farthest_m)
-    np.fmax(merged_error, least_error, out=error)
+    np.clip(merged_error, least_error, MAX_RELATIVE_ERROR, out=error)
     error[is_unknown] = np.inf
     np.divide(layers.blur_px, np.float32(reading.scale), out=layers.blur_px)
     return layers

@@ -123,6 +123,18 @@ def test_the_side_is_the_one_that_is_off_by_less_on_average(
     np.testing.assert_allclose(layers.p_near, p_near, rtol=1e-4)
 
 
+def test_doubt_between_depths_far_apart_is_said_and_still_an_answer(folder: Path) -> None:
+    values = dict.fromkeys(MAPS, 0.0) | {"blur_px": 2.0, "blur_log_error": -3.0, "p_near": 0.4, "log_scale": -3.0}
+    values |= {"log_ratio_near": np.log(0.2), "log_ratio_far": np.log(7.0)}
+    maps = {name: np.full((32, 48), value, np.float32) for name, value in values.items()}
+    reading = Reading.of(maps, CAMERA, (64, 96), load_model_folder(folder).manifest)
+    assert decide([reading], (64, 96), "auto")[1].all()
+    layers = all_layers([reading], (64, 96), "auto")()
+    np.testing.assert_allclose(layers.sigma_m, layers.depth_m)
+    told = all_layers([reading], (64, 96), "near")()
+    assert (told.sigma_m < 0.1 * told.depth_m).all()
+
+
 def test_auto_follows_the_features_handed_from_graph_to_graph(estimator: Estimator) -> None:
     rgb = grey(0)
     rgb[:, :48, 0] = 180
