@@ -133,8 +133,9 @@ def test_stated_errors_are_made_larger_by_what_is_found_and_for_stranger_picture
 def test_sides_are_scored_where_the_picture_is_clearly_out_of_focus(
     oracle: Examiner, factor: float, right: float, either: float
 ) -> None:
-    """The oracle takes grey for far, and the truth is near: the other hypothesis has it."""
-    outcome, _ = oracle.answer(replace(case(factor), side="auto"))
+    """The oracle takes what is not red for far, and the truth is near: the other hypothesis has it."""
+    as_bright = np.full((64, 96, 3), (0, LEVEL, 2 * LEVEL), np.uint8)
+    outcome, _ = oracle.answer(replace(case(factor), image=as_bright, side="auto"))
     assert outcome.sides == Sides(right, either, 64 * 86)
     told, _ = oracle.answer(case(factor))
     assert told.sides is None
