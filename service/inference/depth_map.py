@@ -1,6 +1,6 @@
 """The answer to one photograph, and how raw maps become it."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Self
@@ -17,6 +17,7 @@ from service.optics import thin_lens
 from service.optics.camera import Camera
 
 MAX_RELATIVE_ERROR = 1.0
+MOST_STATED = 0.999  # of depth: an answer that doubts its side states no more, and is one all the same
 NO_ANSWER = np.float32(1e3)  # a relative error that no reading states
 LEAST_BLUR_ERROR_PX = 0.05  # nobody reads blur better: no stated error is below what it does to depth
 
@@ -27,44 +28,61 @@ Array = NDArray[np.float32]
 class Reading:
     """What one copy of the photograph says at its cells, with the camera at that copy's size.
 
-    ``near_m`` and ``far_m`` are both hypotheses, the far one NaN where blur is too strong for it by more than two
-    standard deviations (beyond focus x stays below 1). ``error`` is that of depth, relative: ``NO_ANSWER`` where the
-    copy shows more blur than the model was trained on. ``trained_m`` are the nearest and the farthest depth it knows.
+    ``depth_m`` is the answer of both hypotheses together, ``other_m`` the less likely one: NaN where blur is too strong
+    for a far one by more than two standard deviations (beyond focus x stays below 1). ``error`` is that of depth,
+    relative: ``NO_ANSWER`` where blur, depth or the error itself is beyond what the model knows. ``blur_px`` is in
+    pixels of the photograph.
     """
 
-    near_m: Array
-    far_m: Array
+    depth_m: Array
+    other_m: Array
     p_near: Array
     error: Array
     blur_px: Array
     camera: Camera
     scale: float
-    trained_m: tuple[float, float]
     ratio: Ratio
 
     @classmethod
-    def of(cls, maps: RawMaps, camera: Camera, photograph_size: tuple[int, int], manifest: Manifest) -> Self:
-        """``photograph_size`` is (height, width). The maps are taken over and written over: they may be large."""
-        blur_px, near_m, far_m = maps["blur_px"], maps["log_ratio_near"], maps["log_ratio_far"]
-        error = maps["log_scale"]
-        focus_m = np.float32(camera.focus_distance_m)
+    def of(
+        cls, maps: RawMaps, camera: Camera, photograph_size: tuple[int, int], manifest: Manifest, side: Side
+    ) -> Self:
+        """``photograph_size`` is (height, width). The maps are taken over and written over: they may be large.
+
+        Where the side is given its hypothesis is the answer, but near where no far one can exist. No error is stated
+        below the floor of optics.
+        """
+        blur_px, p_near = maps["blur_px"], maps["p_near"]
+        depth_m, other_m, error = maps["log_ratio_near"], maps["log_ratio_far"], maps["log_scale"]
+        focus_m, temperature = np.float32(camera.focus_distance_m), np.float32(manifest.temperature)
+        floor = thin_lens.depth_error(1.0, camera.focus_distance_m, camera.k_cam_px, LEAST_BLUR_ERROR_PX)
+        nearest, farthest = manifest.ranges.depth_ratio
+        scale = camera.image_width_px / photograph_size[1]
+        if side != "auto":
+            p_near.fill(side == "near")
         for rows in bands(blur_px.shape):
             at_least_px = blur_px[rows] * np.exp(-2 * SIGMA_OF_LAPLACE * np.exp(maps["blur_log_error"][rows]))
             least_x = thin_lens.relative_defocus_from_blur(at_least_px, camera.gamma_px, camera.k_cam_px)
-            near_m[rows] = np.exp(near_m[rows]) * focus_m
-            far_m[rows] = np.where(least_x < 1, np.exp(far_m[rows]) * focus_m, np.float32(np.nan))
-            error[rows] = np.exp(error[rows]) * (SIGMA_OF_LAPLACE * np.float32(manifest.temperature))
-            error[rows][blur_px[rows] > manifest.ranges.blur_px.high] = NO_ANSWER
-        nearest, farthest = manifest.ranges.depth_ratio
+            has_far = least_x < 1
+            near_m = np.exp(depth_m[rows]) * focus_m
+            far_m = np.where(has_far, np.exp(other_m[rows]) * focus_m, near_m)
+            np.copyto(p_near[rows], 1, where=~has_far)
+            own = np.exp(error[rows]) * (SIGMA_OF_LAPLACE * temperature)
+            answer_m, deviation, is_far = merged(near_m, far_m, p_near[rows], own)
+            least = np.float32(floor) * answer_m
+            is_known = (np.fmax(own, least) <= MAX_RELATIVE_ERROR) & (blur_px[rows] <= manifest.ranges.blur_px.high)
+            is_known &= (nearest * focus_m <= answer_m) & (answer_m <= farthest * focus_m)
+            depth_m[rows] = answer_m
+            other_m[rows] = np.where(is_far, near_m, np.where(has_far, far_m, np.float32(np.nan)))
+            error[rows] = np.where(is_known, np.clip(deviation, least, MOST_STATED), NO_ANSWER)
         return cls(
-            near_m,
-            far_m,
-            maps["p_near"],
+            depth_m,
+            other_m,
+            p_near,
             error,
-            blur_px,
+            np.divide(blur_px, np.float32(scale), out=blur_px),
             camera,
-            camera.image_width_px / photograph_size[1],
-            (nearest * camera.focus_distance_m, farthest * camera.focus_distance_m),
+            scale,
             Ratio.between(photograph_size, (camera.image_height_px, camera.image_width_px), manifest.stride),
         )
 
@@ -82,24 +100,6 @@ class Layers:
     def cut(self, part: Part) -> "Layers":
         """A part of all layers, not copied."""
         return Layers(*(part.of(getattr(self, name)) for name in self.__slots__))
-
-    def take(self, other: "Layers", where: NDArray[np.bool_]) -> None:
-        """Copy layers of the same size where told."""
-        for name in self.__slots__:
-            np.copyto(getattr(self, name), getattr(other, name), where=where)
-
-    def put(self, rows: slice, told: "Layers") -> None:
-        """Fill in those rows."""
-        for name in self.__slots__:
-            getattr(self, name)[rows] = getattr(told, name)
-
-    def hide_unanswered(self) -> NDArray[np.bool_]:
-        """Which pixels have an answer; NaN goes where there is none."""
-        valid = np.isfinite(self.sigma_m)
-        if not valid.all():
-            for hidden in (self.depth_m, self.depth_alt_m, self.sigma_m):
-                hidden[~valid] = np.nan
-        return valid
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,66 +159,41 @@ class DepthMap:
         return float(self.valid.mean())
 
 
-def decide(readings: list[Reading], size: tuple[int, int], side: Side) -> tuple[Array, NDArray[np.bool_]]:
+def decide(readings: list[Reading], size: tuple[int, int]) -> tuple[Array, NDArray[np.bool_]]:
     """Depth (height, width) and which pixels have an answer; the surest reading wins, pixel by pixel."""
     depth_m, valid = np.empty(size, np.float32), np.empty(size, np.bool_)
-    for rows, told, known in _decided(readings, size, side):
-        depth_m[rows], valid[rows] = told.depth_m, known
+    for rows in bands(size):
+        error, depth_m[rows] = _surest(readings, rows, size[1], "depth_m")
+        valid[rows] = error <= MAX_RELATIVE_ERROR
+    depth_m[~valid] = np.nan
     return depth_m, valid
 
 
-def all_layers(readings: list[Reading], size: tuple[int, int], side: Side) -> Callable[[], Layers]:
+def all_layers(readings: list[Reading], size: tuple[int, int]) -> Callable[[], Layers]:
     """What makes all maps when first called, and gives the same ones after."""
 
     @cache
     def made() -> Layers:
         layers = Layers(*(np.empty(size, np.float32) for _ in Layers.__slots__))
-        for rows, told, _ in _decided(readings, size, side):
-            layers.put(rows, told)
+        for rows in bands(size):
+            error, *maps = _surest(readings, rows, size[1], "depth_m", "other_m", "p_near", "blur_px")
+            layers.depth_m[rows], layers.depth_alt_m[rows], layers.p_near[rows], layers.blur_px[rows] = maps
+            layers.sigma_m[rows] = error * maps[0]
+            for hidden in (layers.depth_m, layers.depth_alt_m, layers.sigma_m):
+                hidden[rows][error > MAX_RELATIVE_ERROR] = np.nan
         return layers
 
     return made
 
 
-def _decided(
-    readings: list[Reading], size: tuple[int, int], side: Side
-) -> Iterator[tuple[slice, Layers, NDArray[np.bool_]]]:
-    """Rows, what they show, and which of their pixels have an answer."""
-    for rows in bands(size):
-        told, *others = (_told(_sampled(reading, rows, size[1]), reading, side) for reading in readings)
-        for other in others:
-            told.take(other, other.sigma_m < told.sigma_m)
-        np.multiply(told.sigma_m, told.depth_m, out=told.sigma_m)
-        yield rows, told, told.hide_unanswered()
-
-
-def _sampled(reading: Reading, rows: slice, width: int) -> Layers:
-    """What one reading says at every pixel: as depth the near hypothesis yet, as the other the far one."""
-    maps = reading.near_m, reading.far_m, reading.p_near, reading.error, reading.blur_px
-    return Layers(*(sample(values, reading.ratio, rows, width) for values in maps))
-
-
-def _told(layers: Layers, reading: Reading, side: Side) -> Layers:
-    """The layers with depth where it is, ``sigma_m`` relative yet and infinite where there is no answer.
-
-    Depth and error are those of both hypotheses together, unless the side is given; where no far answer can exist it is
-    near, always. No error is stated below the floor of optics.
-    """
-    near_m, far_m, p_near, error = layers.depth_m, layers.depth_alt_m, layers.p_near, layers.sigma_m
-    if side != "auto":
-        p_near.fill(side == "near")
-    has_no_far = np.isnan(far_m)
-    np.copyto(p_near, 1, where=has_no_far)
-    depth_m, merged_error, is_far = merged(near_m, np.where(has_no_far, near_m, far_m), p_near, error)
-    np.copyto(far_m, near_m, where=is_far)
-    near_m[:] = depth_m
-    camera = reading.camera
-    floor = thin_lens.depth_error(1.0, camera.focus_distance_m, camera.k_cam_px, LEAST_BLUR_ERROR_PX)
-    least_error = np.float32(floor) * depth_m
-    nearest_m, farthest_m = reading.trained_m
-    is_unknown = (error > MAX_RELATIVE_ERROR) | (least_error > MAX_RELATIVE_ERROR)
-    is_unknown |= (depth_m < nearest_m) | (depth_m > farthest_m)
-    np.clip(merged_error, least_error, MAX_RELATIVE_ERROR, out=error)
-    error[is_unknown] = np.inf
-    np.divide(layers.blur_px, np.float32(reading.scale), out=layers.blur_px)
-    return layers
+def _surest(readings: list[Reading], rows: slice, width: int, *names: str) -> list[Array]:
+    """The errors at those rows, and the named maps of the reading that is surest at each pixel."""
+    told, *others = (
+        [sample(getattr(reading, name), reading.ratio, rows, width) for name in ("error", *names)]
+        for reading in readings
+    )
+    for other in others:
+        is_surer = other[0] < told[0]
+        for mine, theirs in zip(told, other, strict=True):
+            np.copyto(mine, theirs, where=is_surer)
+    return told

@@ -95,11 +95,11 @@ class Estimator:
             self._free_memory_later()
         cancellation.check()
         with stopwatch.stage("encode"):
-            depth_m, valid = decide(readings, (height, width), side)
+            depth_m, valid = decide(readings, (height, width))
         return DepthMap(
             depth_m=depth_m,
             valid=valid,
-            layers=all_layers(readings, (height, width), side),
+            layers=all_layers(readings, (height, width)),
             camera=camera,
             scales=tuple(reading.scale for reading in readings),
             warnings=(*self._warnings(readings), *_sparseness(valid)),
@@ -122,7 +122,7 @@ class Estimator:
     def _second_scale(self, first: Reading) -> float | None:
         """A smaller copy, where the first shows more blur than the model reads well; None without need."""
         ranges = self.manifest.ranges
-        if (first.blur_px > HIGH_BLUR * ranges.blur_px.high).mean() <= HIGH_BLUR_FRACTION:
+        if (first.scale * first.blur_px > HIGH_BLUR * ranges.blur_px.high).mean() <= HIGH_BLUR_FRACTION:
             return None
         change = max(SECOND_SCALE, ranges.k_cam_px.low / first.camera.k_cam_px)
         return first.scale * change if change <= LEAST_CHANGE_OF_SCALE else None
@@ -148,7 +148,7 @@ class Estimator:
             stride=self.manifest.stride,
             pixel_budget=self._pixel_budget,
         )
-        return Reading.of(maps, working, rgb.shape[:2], self.manifest)
+        return Reading.of(maps, working, rgb.shape[:2], self.manifest, side)
 
     def _warnings(self, readings: list[Reading]) -> list[str]:
         first, last, ranges = readings[0], readings[-1], self.manifest.ranges
@@ -163,7 +163,7 @@ class Estimator:
         told += _outside("focus_distance_m", first.camera.focus_distance_m, ranges.focus_distance_m)
         if first.camera.intrinsics:
             told += _outside("fx_px at that size", first.camera.intrinsics.fx_px, ranges.focal_length_px)
-        blurrier = float((last.blur_px > ranges.blur_px.high).mean())
+        blurrier = float((last.scale * last.blur_px > ranges.blur_px.high).mean())
         if blurrier > HIGH_BLUR_FRACTION:
             told.append(f"{blurrier:.0%} of the pixels show more blur than the model was trained on")
         return told

@@ -67,12 +67,12 @@ def test_tiled_equals_untiled(pair: GraphPair, height: int, width: int) -> None:
     camera = Camera(width, height, 2.0, 6.0, 0.5)
     whole = Estimator(pair, pixel_budget=10**9).estimate(rgb, camera)
     tiled = Estimator(pair, pixel_budget=200_000).estimate(rgb, camera)
-    decided = np.abs(whole.p_near - 0.5) > 1e-3
-    assert decided.mean() > 0.98
-    for name in ("depth_m", "depth_alt_m", "p_near", "sigma_m", "blur_px"):
-        np.testing.assert_allclose(
-            getattr(tiled, name)[decided], getattr(whole, name)[decided], rtol=1e-4, atol=1e-5, err_msg=name
-        )
+    for name in ("p_near", "blur_px"):
+        np.testing.assert_allclose(getattr(tiled, name), getattr(whole, name), rtol=1e-4, atol=1e-5, err_msg=name)
+    for name in ("depth_m", "depth_alt_m", "sigma_m"):
+        # a cell whose two sides are in the balance tips with the last digit
+        same = np.isclose(getattr(tiled, name), getattr(whole, name), rtol=1e-4, atol=1e-5, equal_nan=True)
+        assert same.mean() > 0.999, name
 
 
 def test_a_tile_is_never_much_larger_than_the_budget() -> None:
