@@ -122,7 +122,7 @@ class Estimator:
     def _second_scale(self, first: Reading) -> float | None:
         """A smaller copy, where the first shows more blur than the model reads well; None without need."""
         ranges = self.manifest.ranges
-        if (first.scale * first.blur_px > HIGH_BLUR * ranges.blur_px.high).mean() <= HIGH_BLUR_FRACTION:
+        if (first.blur_px > HIGH_BLUR * ranges.blur_px.high / first.scale).mean() <= HIGH_BLUR_FRACTION:
             return None
         change = max(SECOND_SCALE, ranges.k_cam_px.low / first.camera.k_cam_px)
         return first.scale * change if change <= LEAST_CHANGE_OF_SCALE else None
@@ -163,7 +163,7 @@ class Estimator:
         told += _outside("focus_distance_m", first.camera.focus_distance_m, ranges.focus_distance_m)
         if first.camera.intrinsics:
             told += _outside("fx_px at that size", first.camera.intrinsics.fx_px, ranges.focal_length_px)
-        blurrier = float((last.scale * last.blur_px > ranges.blur_px.high).mean())
+        blurrier = float((last.blur_px > ranges.blur_px.high / last.scale).mean())
         if blurrier > HIGH_BLUR_FRACTION:
             told.append(f"{blurrier:.0%} of the pixels show more blur than the model was trained on")
         return told

@@ -57,7 +57,9 @@ def test_a_reader_that_disagrees_with_itself_leaves_no_seam() -> None:
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> GraphPair:
-    return GraphPair(load_model_folder(build_oracle_pair(tmp_path_factory.mktemp("model"))), 1)
+    # so unsure that depth does not jump where neither side is likelier
+    folder = build_oracle_pair(tmp_path_factory.mktemp("model"), depth_scale=0.3)
+    return GraphPair(load_model_folder(folder), 1)
 
 
 @pytest.mark.parametrize(("height", "width"), [(701, 1003), (400, 1600)])
@@ -67,12 +69,11 @@ def test_tiled_equals_untiled(pair: GraphPair, height: int, width: int) -> None:
     camera = Camera(width, height, 2.0, 6.0, 0.5)
     whole = Estimator(pair, pixel_budget=10**9).estimate(rgb, camera)
     tiled = Estimator(pair, pixel_budget=200_000).estimate(rgb, camera)
-    for name in ("p_near", "blur_px"):
+    for name in ("depth_m", "p_near", "sigma_m", "blur_px"):
         np.testing.assert_allclose(getattr(tiled, name), getattr(whole, name), rtol=1e-4, atol=1e-5, err_msg=name)
-    for name in ("depth_m", "depth_alt_m", "sigma_m"):
-        # a cell whose two sides are in the balance tips with the last digit
-        same = np.isclose(getattr(tiled, name), getattr(whole, name), rtol=1e-4, atol=1e-5, equal_nan=True)
-        assert same.mean() > 0.999, name
+    # there the last digit says which side is the other
+    same = np.isclose(tiled.depth_alt_m, whole.depth_alt_m, rtol=1e-4, atol=1e-5)
+    assert same.mean() > 0.999
 
 
 def test_a_tile_is_never_much_larger_than_the_budget() -> None:
