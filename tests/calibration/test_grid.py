@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from service.calibration.grid import GridError, find_grid
+from service.calibration.grid import THRESHOLDS, GridError, find_grid
 from service.calibration.target import CircleGrid
 
 TALL = CircleGrid("asymmetric_circles", 11, 4, 20.0, 14.0)
@@ -119,3 +119,25 @@ def test_small_circles_are_too_small_and_nothing_is_nothing() -> None:
 def test_a_picture_of_no_size_is_no_grid(shape: tuple[int, int]) -> None:
     with pytest.raises(GridError, match="no grid"):
         find_grid(np.full(shape, 200, np.uint8), TALL)
+
+
+def test_a_picture_full_of_dots_is_told_apart_from_the_pattern() -> None:
+    cell = np.full((8, 8), 240, np.uint8)
+    cv2.circle(cell, (4, 4), 3, 20, -1)
+    with pytest.raises(GridError, match=r"at least 1[78]\d circles"):
+        find_grid(np.tile(cell, (60, 80)), TALL)
+
+
+def test_blobs_are_looked_for_in_steps_that_can_be_stopped() -> None:
+    class Stopped(Exception):
+        pass
+
+    looks: list[int] = []
+
+    def check() -> None:
+        looks.append(len(looks))
+        if len(looks) == len(THRESHOLDS) // 2:
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        find_grid(drawn(TALL, view(TALL)), TALL, check)
