@@ -85,7 +85,10 @@ def _focus_m(exif: Exif, warnings: list[str]) -> float | None:
     if distance_m is None or not FOCUS_DISTANCES_M[0] <= distance_m <= FOCUS_DISTANCES_M[1]:
         warnings.append("its EXIF does not say where the lens was focused: focus_distance_m is needed")
         return None
-    warnings.append(f"focused at {distance_m:g} m as the camera reports it, which is often coarse: measure if you can")
+    warnings.append(
+        f"focused at {distance_m:g} m as the camera reports it, which is often coarse: better measure from the lens to "
+        "what is sharpest"
+    )
     return distance_m
 
 
