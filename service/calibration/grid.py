@@ -168,7 +168,7 @@ def _blobs(grey: NDArray[np.uint8], check: Callable[[], None]) -> _Blobs:
         check()
         found = _seen_at(float(threshold), grey)
         numbers = _continued(found, last)
-        last = np.pad(last, ((0, max(int(numbers.max(initial=-1)) + 1 - len(last), 0)), (0, 0)))
+        last = np.concatenate([last, found[numbers >= len(last)]])
         last[numbers] = found
         seen.append((numbers, found))
     numbers, found = (np.concatenate(parts) for parts in zip(*seen, strict=True))
