@@ -8,11 +8,11 @@ import { html } from "./vendor/preact.js";
  * @param {{camera: any, points: any[] | null}} props `camera` as the API reads or previews it
  */
 export function CameraCurve({ camera, points }) {
-  const { near, far } = camera.range_m;
+  const { far } = camera.range_m;
   return html`
     <dl class="figures">
       <div><dt>k_cam</dt><dd>${short(camera.k_cam_px, 4)} <small>px</small></dd></div>
-      <div><dt>Usable range</dt><dd>${short(near)} to ${short(far)} <small>m</small></dd></div>
+      <div><dt>Usable range</dt><dd>up to ${short(far)} <small>m</small></dd></div>
       <div><dt>Focal length</dt><dd>${short(camera.fx_px, 4)} <small>px</small></dd></div>
     </dl>
     <p class="hint">Up to ${short(far)} m, a blur read wrong by 0.25 px moves the depth by less than 10 %.</p>

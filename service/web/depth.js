@@ -460,7 +460,7 @@ function placeOfWarning(text) {
 
 /** @param {any} camera */
 function about({ image_width_px, image_height_px, focus_distance_m, range_m, description }) {
-  const range = `reads ${short(range_m.near, 2)} to ${short(range_m.far, 2)} m well`;
+  const range = `reads up to ${short(range_m.far, 2)} m well`;
   const numbers = `${image_width_px} × ${image_height_px} px, focused at ${focus_distance_m} m, ${range}`;
   return description ? `${description}. ${numbers}` : numbers;
 }

@@ -27,6 +27,7 @@ READY_MS = 60_000
 FORMATS = ("png", "npy", "npz", "tiff", "ply", "preview", "json")
 # no graphics card, and nothing in its place
 NO_GRAPHICS = ["--no-sandbox", "--disable-gpu", "--disable-software-rasterizer"]
+PHONE = {"viewport": {"width": 390, "height": 760}, "device_scale_factor": 2, "is_mobile": True, "has_touch": True}
 # what the console says of every answer that is no success
 REFUSED = "Failed to load resource"
 GIVE = """(place, {bytes, name, kind}) => {
@@ -313,6 +314,31 @@ def test_nothing_keeps_people_out(measured: Page, barriers: Callable[[Page], lis
     assert measured.evaluate(OVERFLOW) <= 0
     measured.get_by_role("tab", name="3D").click()
     assert barriers(measured) == []
+
+
+def test_a_phone_takes_the_photograph_and_fingers_read_it(
+    served: Server, browser: Browser, d200: dict[str, Any], maps: Callable[..., Any]
+) -> None:
+    served.add(d200)
+    with watched(browser, served.url, [], **PHONE) as page:
+        page.set_default_timeout(READY_MS)
+        page.goto("")
+        choose(page)
+        with page.expect_file_chooser() as asked:
+            page.get_by_role("button", name="Take one").tap()
+        assert asked.value.element.get_attribute("capture") == "environment"
+        asked.value.set_files(PHOTOGRAPH)
+        picture, known = stage(page), maps()
+        assert page.evaluate(OVERFLOW) <= 0
+        for u, v in ((100, 300), (520, 180)):
+            picture.tap(position=place_of(picture, u, v))
+            seen = shown_pixel(page)
+            assert np.hypot(seen[0] - u, seen[1] - v) < 3
+            assert number_in(page, "depth") == pytest.approx(known["depth_m"][seen[1], seen[0]], abs=0.0006)
+        expect(page.locator("[data-value=distance]")).to_be_visible()
+        page.get_by_role("tab", name="3D").tap()
+        cloud = page.get_by_role("application", name="Points in space")
+        expect(cloud).to_have_attribute("data-points", str(int(known["valid"].sum())), timeout=READY_MS)
 
 
 def test_without_webgl_the_page_says_so(served: Server, d200: dict[str, Any], browser: Browser) -> None:
