@@ -203,25 +203,29 @@ def _pattern(rng: np.random.Generator, size: int) -> Image:
     along = (np.float32(np.cos(turn)) * at[:, None] - np.float32(np.sin(turn)) * at[None, :]) * stretch
     if rng.random() < BENT_SHARE:
         across += np.float32(rng.uniform(0, 2)) * _smooth_field(rng, span)
-    kind, part = rng.choice(PATTERNS), np.float32(rng.uniform(0.1, 0.6))
-    if kind == "bricks":
-        along += np.floor(across) % 2 / 2
-    u, v = across % 1, along % 1
-    if kind == "stripes":
-        cover = (u < part).astype(np.float32)
-    elif kind == "checks":
-        cover = ((u < 0.5) == (v < 0.5)).astype(np.float32)
-    elif kind == "dots":
-        cover = (np.hypot(u - 0.5, v - 0.5) < part / 1.2).astype(np.float32)
-    elif kind == "bricks":
-        shades = rng.uniform(0.7, 1, (16, 16)).astype(np.float32)
-        cover = shades[np.floor(across).astype(int) % 16, np.floor(along).astype(int) % 16]
-        cover = cover * ((u > part / 4) & (v > part / 4 * stretch))
-    else:
-        cover = np.asarray(0.5 + 0.5 * np.sin(2 * np.pi * across), np.float32) ** np.float32(rng.uniform(0.5, 4))
+    cover = _motif(rng, str(rng.choice(PATTERNS)), across, along, stretch)
     ground, motif = _paint(rng), _paint(rng)
     seen = np.asarray(cv2.resize(cover, (size, size), interpolation=cv2.INTER_AREA), np.float32)
     return np.asarray(np.clip(ground + seen[..., None] * (motif - ground), 0, 1), np.float32)
+
+
+def _motif(rng: np.random.Generator, kind: str, across: Image, along: Image, stretch: np.float32) -> Image:
+    """How much of each place [n, n] a pattern's motif covers: one in each unit of ``across`` and ``along``."""
+    part = np.float32(rng.uniform(0.1, 0.6))
+    if kind == "bricks":
+        along = along + np.floor(across) % 2 / 2
+    u, v = across % 1, along % 1
+    if kind == "stripes":
+        return np.asarray(u < part, np.float32)
+    if kind == "checks":
+        return np.asarray((u < 0.5) == (v < 0.5), np.float32)
+    if kind == "dots":
+        return np.asarray(np.hypot(u - 0.5, v - 0.5) < part / 1.2, np.float32)
+    if kind == "bricks":
+        shades = rng.uniform(0.7, 1, (16, 16)).astype(np.float32)
+        stones = shades[np.floor(across).astype(int) % 16, np.floor(along).astype(int) % 16]
+        return np.asarray(stones * ((u > part / 4) & (v > part / 4 * stretch)), np.float32)
+    return np.asarray(0.5 + 0.5 * np.sin(2 * np.pi * across), np.float32) ** np.float32(rng.uniform(0.5, 4))
 
 
 def _clouds(rng: np.random.Generator, size: int) -> Image:
