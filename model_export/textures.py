@@ -213,7 +213,7 @@ def _motif(rng: np.random.Generator, kind: str, across: Image, along: Image, str
     """How much of each place [n, n] a pattern's motif covers: one in each unit of ``across`` and ``along``."""
     part = np.float32(rng.uniform(0.1, 0.6))
     if kind == "bricks":
-        along = along + np.floor(across) % 2 / 2
+        along = np.asarray(along + np.floor(across) % 2 / 2, np.float32)
     u, v = across % 1, along % 1
     if kind == "stripes":
         return np.asarray(u < part, np.float32)
