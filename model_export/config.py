@@ -27,7 +27,8 @@ class SceneConfig:
 class TrainConfig:
     """A training run: ``steps`` batches, drawn from a pool that ``fresh_per_step`` new scenes flow through.
 
-    The last ``settled_share`` of the steps has the batch norms' statistics fixed, as the exported network has.
+    The last ``settled_share`` of the steps has the batch norms' statistics fixed, as the exported network has: all of
+    them in a run that begins with weights.
     """
 
     kind: Kind = "compact"

@@ -320,8 +320,9 @@ def train(
 ) -> Path:
     """Train in folder ``run``, going on from its checkpoint if there is one; the path of the last checkpoint.
 
-    A run without a checkpoint begins with the ``weights`` of a checkpoint or a model folder, or with random ones. Torch
-    computes on the cores that ``workers`` leave, so other workers are another run by rounding.
+    A run without a checkpoint begins with the ``weights`` of a checkpoint or a model folder, whose norms stay as they
+    are (a batch's own statistics cost it at once what it would need thousands of steps to win back), or with random
+    ones. Torch computes on the cores that ``workers`` leave, so other workers are another run by rounding.
     Raises ``ValueError`` for weights of another kind.
     """
     console = console or Console(stderr=True)
@@ -329,6 +330,10 @@ def train(
     run.mkdir(parents=True, exist_ok=True)
     path = run / "checkpoint.pt"
     resume = Checkpoint.load(path) if path.exists() else None
+    if resume is not None:
+        config = replace(config, settled_share=resume.config.settled_share)
+    elif weights is not None:
+        config = replace(config, settled_share=1.0)
     trainer = Trainer(config, device, resume)
     start = starting_pair(weights, config.kind) if weights is not None and resume is None else None
     pool = Pool(config, photographs, trainer.step, workers)
@@ -346,7 +351,7 @@ def train(
         recent: list[dict[str, float]] = []
         pace = Pace()
         while trainer.step < config.steps:
-            if trainer.step == settling_step(config):
+            if trainer.step == settling_step(config) > 0:
                 trainer.settle(pool.settling())
             recent.append(trainer.advance(pool.batch(trainer.step)))
             with pace.waiting():

@@ -105,6 +105,26 @@ def test_a_new_run_goes_on_from_a_model_folder() -> None:
     torch.testing.assert_close(begun.state_dict(), shipped.state_dict(), rtol=1e-3, atol=1e-4)
 
 
+def test_a_run_that_begins_with_weights_keeps_their_statistics(textures: Path, tmp_path: Path) -> None:
+    first, _ = run(CONFIG, textures, tmp_path / "first")
+    said = Console(file=StringIO())
+    for steps in (3, 6):  # the second time it goes on
+        path = train(
+            replace(CONFIG, seed=2, steps=steps),
+            textures,
+            tmp_path / "second",
+            weights=tmp_path / "first" / "checkpoint.pt" if steps == 3 else None,
+            workers=0,
+            console=said,
+        )
+    second = Checkpoint.load(path)
+    assert second.step == 6
+    for name, own in first.modules.items():
+        if "running" in name:
+            torch.testing.assert_close(second.modules[name], own, rtol=0, atol=0, msg=name)
+    assert any(not torch.equal(second.modules[name], own) for name, own in first.modules.items())
+
+
 def test_a_stopped_run_goes_on_as_if_it_had_not_been_stopped(textures: Path, tmp_path: Path) -> None:
     whole, _ = run(CONFIG, textures, tmp_path / "whole")
     (tmp_path / "stopped").mkdir()
