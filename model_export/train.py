@@ -320,22 +320,16 @@ def train(
 ) -> Path:
     """Train in folder ``run``, going on from its checkpoint if there is one; the path of the last checkpoint.
 
-    A run without a checkpoint begins with the ``weights`` of a checkpoint or a model folder, whose norms stay as they
-    are (a batch's own statistics cost it at once what it would need thousands of steps to win back), or with random
-    ones. Torch computes on the cores that ``workers`` leave, so other workers are another run by rounding.
+    A run without a checkpoint begins with the ``weights`` of a checkpoint or a model folder, or with random ones. Torch
+    computes on the cores that ``workers`` leave, so other workers are another run by rounding.
     Raises ``ValueError`` for weights of another kind.
     """
     console = console or Console(stderr=True)
     photographs = load_photographs(textures)
     run.mkdir(parents=True, exist_ok=True)
     path = run / "checkpoint.pt"
-    resume = Checkpoint.load(path) if path.exists() else None
-    if resume is not None:
-        config = replace(config, settled_share=resume.config.settled_share)
-    elif weights is not None:
-        config = replace(config, settled_share=1.0)
-    trainer = Trainer(config, device, resume)
-    start = starting_pair(weights, config.kind) if weights is not None and resume is None else None
+    trainer, start = _opened(config, path, weights, device)
+    config = trainer.config
     pool = Pool(config, photographs, trainer.step, workers)
     test = held_out(config.scenes, photographs, 2 * config.batch)
     # two busy processes on one core cost each far more than half its speed
@@ -362,6 +356,19 @@ def train(
                 console.print(_report(trainer, recent, test, pace))
                 recent, pace = [], Pace()
     return path
+
+
+def _opened(config: TrainConfig, path: Path, weights: Path | None, device: str) -> tuple[Trainer, Pair | None]:
+    """The trainer of a run, as its checkpoint left it if there is one, and the networks that a new run begins with.
+
+    With such networks the norms' statistics stay as they are: a batch's own would undo much of what was learned.
+    """
+    if path.exists():
+        resume = Checkpoint.load(path)
+        return Trainer(replace(config, settled_share=resume.config.settled_share), device, resume), None
+    if weights is None:
+        return Trainer(config, device), None
+    return Trainer(replace(config, settled_share=1.0), device), starting_pair(weights, config.kind)
 
 
 def _report(trainer: Trainer, recent: list[dict[str, float]], test: Batch, pace: Pace) -> str:
