@@ -63,6 +63,9 @@ def train(
     weights: Annotated[
         Path | None, typer.Option(help="checkpoint or model folder whose weights a new run begins with", exists=True)
     ] = None,
+    teacher: Annotated[
+        Path | None, typer.Option(help="checkpoint or model folder whose answers are learned too", exists=True)
+    ] = None,
     learning_rate: Annotated[float, typer.Option(min=1e-6, max=1e-2, help="before it falls")] = 1e-3,
     workers: Annotated[int, typer.Option(min=0, max=64, help="processes that draw scenes")] = 1,
     device: Annotated[str, typer.Option(help="torch device")] = "cpu",
@@ -78,10 +81,37 @@ def train(
         kind="paper" if kind == "paper" else "compact", seed=seed, steps=steps, learning_rate=learning_rate
     )
     try:
-        path = run_training(config, textures, run, weights=weights, workers=workers, device=device)
+        path = run_training(config, textures, run, weights=weights, teacher=teacher, workers=workers, device=device)
     except (FileNotFoundError, ValueError) as exc:
         raise _fail(str(exc)) from exc
     typer.echo(path)
+
+
+def _channels(text: str) -> tuple[int, ...]:
+    parts = text.split("-")
+    if not all(part.isdecimal() for part in parts):
+        raise _fail(f"channels are numbers such as 16-32-48-96, not {text}")
+    return tuple(map(int, parts))
+
+
+@commands.command()
+def narrow(
+    textures: Textures,
+    out: Annotated[Path, typer.Option(help="checkpoint file to write, for train --weights", dir_okay=False)],
+    blur: Annotated[str, typer.Option(help="channels of the blur network, finest level first: 16-32-48-96")],
+    depth: Annotated[str, typer.Option(help="channels of the depth network: 16-16-16-48")],
+    model: Model = DEFAULT_MODEL,
+) -> None:
+    """Leave channels out of the compact pair: what they say is written as sums of the others, then trained on from."""
+    with _training_parts():
+        from model_export.narrowed import narrow as run_narrowing
+        from model_export.networks import Widths
+
+    try:
+        change = run_narrowing(model, textures, Widths(_channels(blur), _channels(depth)), out)
+    except (FileNotFoundError, ValueError) as exc:
+        raise _fail(str(exc)) from exc
+    typer.echo(f"{out}: on other scenes blur is {change.blur:.1%} and depth {change.depth:.1%} off that of {model}")
 
 
 @commands.command()

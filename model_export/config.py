@@ -42,6 +42,7 @@ class TrainConfig:
     clip_norm: float = 1.0
     b_weight: float = 1.0
     side_weight: float = 0.3
+    likeness_weight: float = 10.0
     pool: int = 600
     fresh_per_step: float = 1.0
     checkpoint_every: int = 250

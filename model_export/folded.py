@@ -6,7 +6,7 @@ from dataclasses import replace
 import torch
 from torch import nn
 
-from model_export.networks import Normed, Pair
+from model_export.networks import Normed, Pair, batch_norm
 
 
 def folded(pair: Pair) -> Pair:
@@ -20,9 +20,7 @@ def folded(pair: Pair) -> Pair:
 
 
 def _fold(normed: Normed) -> None:
-    norm = normed.norm
-    if not isinstance(norm, nn.BatchNorm2d):
-        raise TypeError("these batch norms are folded already")
+    norm = batch_norm(normed)
     mean, variance = norm.get_buffer("running_mean"), norm.get_buffer("running_var")
     with torch.no_grad():
         gain = norm.weight / (variance + norm.eps).sqrt()

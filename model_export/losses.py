@@ -74,8 +74,25 @@ def _reduced(excess: Tensor, stride: int) -> Tensor:
     return excess[:, :, ::stride, ::stride]
 
 
-def total_loss(pair: Pair, batch: Batch, config: TrainConfig) -> tuple[Tensor, dict[str, Tensor]]:
-    """The loss of a batch and its parts by name, all float32 scalars."""
+def likeness_loss(blur: BlurEstimate, depth: DepthEstimate, teacher: Pair, batch: Batch) -> Tensor:
+    """How far the answers are from a teacher's, most where it is sure: float32 scalar."""
+    with torch.no_grad():
+        wise_blur, wise_depth = run_pair(teacher, batch)
+    sure_blur = torch.exp(-BETA * wise_blur.log_error)
+    sure_depth = torch.exp(-BETA * wise_depth.log_scale) / 2
+    of_blur = sure_blur * (torch.log(blur.blur_px) - torch.log(wise_blur.blur_px)).abs()
+    of_near = sure_depth * (depth.log_ratio_near - wise_depth.log_ratio_near).abs()
+    of_far = sure_depth * (depth.log_ratio_far - wise_depth.log_ratio_far).abs()
+    of_errors = (blur.log_error - wise_blur.log_error).abs() + (depth.log_scale - wise_depth.log_scale).abs()
+    p_near = torch.sigmoid(wise_depth.near_logit)
+    of_side = functional.binary_cross_entropy_with_logits(depth.near_logit, p_near)
+    return (of_blur + of_near + of_far + of_errors / 2).mean() + of_side / 2
+
+
+def total_loss(
+    pair: Pair, batch: Batch, config: TrainConfig, teacher: Pair | None = None
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """The loss of a batch and its parts by name, all float32 scalars; a teacher's part is ``likeness_weight``."""
     blur, depth = run_pair(pair, batch)
     excess = _reduced(batch.excess, pair.stride).float()
     defocus_px = excess.abs() * batch.k_cam_px[:, None, None, None]
@@ -91,4 +108,7 @@ def total_loss(pair: Pair, batch: Batch, config: TrainConfig) -> tuple[Tensor, d
     depth_loss = (asked * laplace(depth_error, depth.log_scale)).mean()
     loss = depth_loss + config.b_weight * blur_loss + config.side_weight * side
     parts = {"loss": loss, "blur": blur_error.mean(), "depth": (asked * depth_error).sum() / asked.sum(), "side": side}
-    return loss, {name: part.detach() for name, part in parts.items()}
+    if teacher is not None:
+        parts["likeness"] = likeness_loss(blur, depth, teacher, batch)
+        parts["loss"] = loss + config.likeness_weight * parts["likeness"]
+    return parts["loss"], {name: part.detach() for name, part in parts.items()}

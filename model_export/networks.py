@@ -9,7 +9,7 @@ probability of near, and the log of the relative error. All maps are [n,1,h/s,w/
 import functools
 import itertools
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -26,6 +26,8 @@ SPREAD_BOUNDS = (0.01, 2.0)
 RATIO_BOUND = 3.5
 LUMINANCE = (0.299, 0.587, 0.114)
 GREY = 0.5
+BLOCK = 16  # maps that ONNX Runtime computes at a time
+CELL = 4  # pixels of 2x2
 
 Features = tuple[Tensor, ...]
 
@@ -58,6 +60,27 @@ class Scene:
     side: Tensor
 
 
+@dataclass(frozen=True, slots=True)
+class Widths:
+    """Channels of both U-Nets, finest level first; the defaults are those of the compact pair that ships."""
+
+    blur: tuple[int, ...] = (16, 32, 48, 96)
+    depth: tuple[int, ...] = (16, 16, 16, 48)
+
+    @classmethod
+    def of(cls, weights: Mapping[str, Tensor]) -> "Widths":
+        """Those of a pair's weights, by the names of ``Pair.modules()``."""
+        return cls(*(_widths_of(network, weights) for network in ("blur", "depth")))
+
+
+def _widths_of(network: str, weights: Mapping[str, Tensor]) -> tuple[int, ...]:
+    kernels = (f"{network}.unet.encoder.{level}.layers.0.ways.0.weight" for level in itertools.count())
+    return tuple(weights[name].shape[0] for name in itertools.takewhile(weights.__contains__, kernels))
+
+
+SHIPPED_WIDTHS = Widths()
+
+
 class BlurNetwork(Protocol):
     def __call__(self, image: Tensor) -> BlurEstimate: ...
 
@@ -79,8 +102,7 @@ class BandEnergy(nn.Module):
     Bands are differences of Gaussians on a pyramid whose next level starts where this one's Gaussian has
     doubled, so each octave costs a quarter of the one before; each energy is smoothed at 1.2 px of its level.
     Beyond the picture its edge goes on. The first octave is computed in cells of 2x2: its energies are needed at half
-    size alone, so every band is four maps of that size, which the smoothing sums. The last of the maps that are seen is
-    the next level.
+    size alone, so each of its Gaussians is four maps of that size, a pixel of the cell each, which the smoothing sums.
     """
 
     OCTAVES = 4
@@ -90,9 +112,14 @@ class BandEnergy(nn.Module):
     RADIUS = 4
     FLOOR = 1e-6
     luminance: Tensor
+    first_across: Tensor
+    first_down: Tensor
     first_bands: Tensor
     first_rows: Tensor
     first_columns: Tensor
+    first_sums: Tensor
+    across: Tensor
+    down: Tensor
     bands: Tensor
     rows: Tensor
     columns: Tensor
@@ -102,19 +129,31 @@ class BandEnergy(nn.Module):
         sigmas = [self.FIRST_SIGMA * 2 ** (i / self.BANDS) for i in range(self.BANDS + 1)]
         # later levels start from a picture that is blurred by FIRST_SIGMA already
         more = [max(s * s - self.FIRST_SIGMA**2, 0.0) ** 0.5 for s in sigmas]
+        first, later = (torch.stack([_gaussian(s, self.RADIUS) for s in several]) for several in (sigmas, more))
         smooth = _gaussian(self.SMOOTH_SIGMA, self.RADIUS)
+        number, pixel = torch.arange(BLOCK) // CELL, torch.arange(BLOCK) % CELL
+        # taps on a cell and those around it: from its first pixel and its second one, and to a sum of both
+        from_cell = torch.stack([functional.pad(first, (0, 1)), functional.pad(first, (1, 0))])
+        to_cell = functional.pad(smooth, (0, 1)).reshape(-1, 2).T
+        later = functional.pad(later, (0, 0, 0, BLOCK - len(later)))
         self._keep("luminance", torch.tensor(LUMINANCE)[None])
-        self._keep("first_bands", _in_cells(self._kernels(sigmas)))
-        self._keep("first_rows", _cell_sums(smooth, 2 * self.BANDS).transpose(2, 3))
-        self._keep("first_columns", _cell_sums(smooth, self.BANDS))
-        self._keep("bands", self._kernels(more))
+        self._keep("first_across", from_cell[pixel % 2, number][:, None, None, :])
+        self._keep("first_down", from_cell[pixel // 2, number][:, None, :, None])
+        self._keep("first_bands", self._differences(CELL))
+        self._keep("first_rows", to_cell[pixel % 2][:, None, None, :])
+        self._keep("first_columns", to_cell[pixel // 2][:, None, :, None])
+        self._keep("first_sums", (number == torch.arange(self.BANDS)[:, None])[:, :, None, None])
+        self._keep("across", later[:, None, None, :])
+        self._keep("down", later[:, None, :, None])
+        self._keep("bands", self._differences(1)[: self.BANDS + 1])
         self._keep("rows", smooth.repeat(self.BANDS, 1)[:, None, None, :])
         self._keep("columns", smooth.repeat(self.BANDS, 1)[:, None, :, None])
 
-    def _kernels(self, sigmas: list[float]) -> Tensor:
-        """The bands between neighbours among Gaussians, and the last Gaussian [b+1,1,t,t]."""
-        squares = [torch.outer(g, g) for g in (_gaussian(s, self.RADIUS) for s in sigmas)]
-        return torch.stack([*(a - b for a, b in itertools.pairwise(squares)), squares[-1]])[:, None]
+    def _differences(self, step: int) -> Tensor:
+        """Gaussians of ``step`` maps each to the bands between neighbours [k,k,1,1]; the last Gaussian stays."""
+        bands = torch.eye(BLOCK)
+        bands[: self.BANDS * step] -= torch.eye(BLOCK)[step : step + self.BANDS * step]
+        return bands[:, :, None, None]
 
     def _keep(self, name: str, values: Tensor) -> None:
         self.register_buffer(name, values.float(), persistent=False)
@@ -126,17 +165,7 @@ class BandEnergy(nn.Module):
         for octave in range(self.OCTAVES):
             # room for a band and for the smoothing of its energy
             padded = functional.pad(level, (2 * self.RADIUS,) * 4, mode="replicate")
-            if octave == 0:
-                seen = functional.conv2d(padded, self.first_bands, stride=2)
-                squares = seen[:, : 4 * self.BANDS] ** 2
-                energy = functional.conv2d(functional.conv2d(squares, self.first_rows), self.first_columns)
-                margin, step = self.RADIUS // 2, 1
-            else:
-                seen = functional.conv2d(padded, self.bands)
-                rows = functional.conv2d(seen[:, : self.BANDS] ** 2, self.rows, groups=self.BANDS)
-                energy = functional.conv2d(rows, self.columns, groups=self.BANDS)
-                margin, step = self.RADIUS, 2
-            level = seen[:, -1:, margin:-margin:step, margin:-margin:step]
+            energy, level = self._later_octave(padded) if octave else self._first_octave(padded)
             energy = torch.log(energy + self.FLOOR)
             if octave > 1:
                 factor = 2.0 ** (octave - 1)
@@ -144,20 +173,24 @@ class BandEnergy(nn.Module):
             energies.append(energy)
         return torch.cat(energies, 1) * 0.25 + 2.0
 
+    def _first_octave(self, padded: Tensor) -> tuple[Tensor, Tensor]:
+        """Energies and the next level, both at half size: maps are cells already."""
+        across = functional.conv2d(padded, self.first_across, stride=(1, 2))
+        blurred = functional.conv2d(across, self.first_down, stride=(2, 1), groups=BLOCK)
+        seen = functional.conv2d(blurred, self.first_bands)
+        rows = functional.conv2d(seen * seen, self.first_rows, groups=BLOCK)
+        energy = functional.conv2d(functional.conv2d(rows, self.first_columns, groups=BLOCK), self.first_sums)
+        margin, last = self.RADIUS // 2, CELL * self.BANDS
+        return energy, seen[:, last : last + 1, margin:-margin, margin:-margin]
 
-def _in_cells(kernels: Tensor) -> Tensor:
-    """Kernels [k,1,t,t] for every other pixel [4k-3,1,t+1,t+1]: all but the last of each pixel in a cell of 2x2."""
-    placed = torch.stack([functional.pad(kernels, (j, 1 - j, i, 1 - i)) for i in (0, 1) for j in (0, 1)], 1)
-    return torch.cat([placed[:-1].flatten(0, 1), placed[-1, :1]])
-
-
-def _cell_sums(taps: Tensor, sums: int) -> Tensor:
-    """What taps [t] of pixels do to both pixels of a cell [sums, 2 sums, (t+1)/2, 1]: each sum has its own two maps."""
-    of_cells = torch.cat([taps, taps.new_zeros(1)]).reshape(-1, 2)
-    kernels = taps.new_zeros(sums, sums, 2, len(of_cells), 1)
-    for number in range(sums):
-        kernels[number, number, :, :, 0] = of_cells.T
-    return kernels.flatten(1, 2)
+    def _later_octave(self, padded: Tensor) -> tuple[Tensor, Tensor]:
+        """Energies at the size of the level, and the next level at half of it."""
+        across = functional.conv2d(padded, self.across)
+        seen = functional.conv2d(functional.conv2d(across, self.down, groups=BLOCK), self.bands)
+        rows = functional.conv2d(seen[:, : self.BANDS] ** 2, self.rows, groups=self.BANDS)
+        energy = functional.conv2d(rows, self.columns, groups=self.BANDS)
+        margin = self.RADIUS
+        return energy, seen[:, -1:, margin:-margin:2, margin:-margin:2]
 
 
 class Normed(nn.Module):
@@ -175,6 +208,13 @@ class Normed(nn.Module):
         parts = (way(x) for way, x in zip(self.ways, maps, strict=True))
         normed: Tensor = self.norm(functools.reduce(torch.add, parts))
         return normed
+
+
+def batch_norm(normed: Normed) -> nn.BatchNorm2d:
+    """A layer's own; raises ``TypeError`` where it is folded away."""
+    if not isinstance(normed.norm, nn.BatchNorm2d):
+        raise TypeError("these batch norms are folded already")
+    return normed.norm
 
 
 class Block(nn.Module):
@@ -295,17 +335,16 @@ def _plane(values: Tensor, like: Tensor) -> Tensor:
 class CompactBlur(nn.Module):
     """Ours: pixels and band energies at half size into a small U-Net; hands its last features on."""
 
-    WIDTHS = (16, 48, 64, 96)
     DILATIONS = (2, 4)
 
-    def __init__(self) -> None:
+    def __init__(self, widths: tuple[int, ...]) -> None:
         super().__init__()
         self.front = BandEnergy()
-        finest = self.WIDTHS[0]
+        finest = widths[0]
         image = convolution(3, finest, size=6, stride=2)
         energies = convolution(BandEnergy.OCTAVES * BandEnergy.BANDS, finest)
-        self.unet = _compact_unet(Normed(image, energies), self.WIDTHS, self.DILATIONS)
-        self.head = nn.Conv2d(self.WIDTHS[0], 2, 1)
+        self.unet = _compact_unet(Normed(image, energies), widths, self.DILATIONS)
+        self.head = nn.Conv2d(finest, 2, 1)
         nn.init.constant_(self.head.get_parameter("bias")[0:1], math.log(2.0))
 
     def forward(self, image: Tensor) -> BlurEstimate:
@@ -325,16 +364,15 @@ class CompactDepth(nn.Module):
     near stays at or before the plane in focus and far behind it.
     """
 
-    WIDTHS = (16, 32, 32, 48)
     DILATIONS = (2, 4)
     PLANES = 8
 
-    def __init__(self) -> None:
+    def __init__(self, features: int, widths: tuple[int, ...]) -> None:
         super().__init__()
-        finest = self.WIDTHS[0]
-        first = Normed(convolution(CompactBlur.WIDTHS[0], finest), convolution(self.PLANES, finest))
-        self.unet = _compact_unet(first, self.WIDTHS, self.DILATIONS)
-        self.head = nn.Conv2d(self.WIDTHS[0], 5, 1)
+        finest = widths[0]
+        first = Normed(convolution(features, finest), convolution(self.PLANES, finest))
+        self.unet = _compact_unet(first, widths, self.DILATIONS)
+        self.head = nn.Conv2d(finest, 5, 1)
         with torch.no_grad():
             self.head.weight.mul_(0.1)
             self.head.get_parameter("bias").copy_(torch.tensor([-0.5, -0.5, 1.5, 0.0, -1.5]))
@@ -412,10 +450,10 @@ class Pair:
         return nn.ModuleDict({"blur": self.blur, "depth": self.depth})
 
 
-def make_pair(kind: Kind) -> Pair:
-    """A fresh pair with random weights (seed torch before)."""
+def make_pair(kind: Kind, widths: Widths = SHIPPED_WIDTHS) -> Pair:
+    """A fresh pair with random weights (seed torch before); ``widths`` are the compact one's: the paper's are fixed."""
     if kind == "compact":
-        return Pair(kind, CompactBlur(), CompactDepth(), stride=2)
+        return Pair(kind, CompactBlur(widths.blur), CompactDepth(widths.blur[0], widths.depth), stride=2)
     return Pair(kind, PaperBlur(), PaperDepth(), stride=1)
 
 

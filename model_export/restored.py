@@ -9,7 +9,7 @@ from onnx import numpy_helper
 from torch import Tensor, nn
 
 from model_export.folded import folded
-from model_export.networks import Normed, Pair, make_pair
+from model_export.networks import Normed, Pair, Widths, batch_norm, make_pair
 from service.inference.artifact import load_model_folder
 
 PREFIX = "network."
@@ -22,26 +22,19 @@ def restored(model: Path) -> Pair:
     Its batch norms do nothing yet but add: ``spread_norms`` gives them their part. Raises ``ValueError`` for a folder
     whose graphs are not the folded form of the compact pair.
     """
-    folder = load_model_folder(model)
-    pair = make_pair("compact")
-    pair.modules().eval()
-    whole = folded(pair)
-    for network, graph in ((whole.blur, folder.manifest.graphs.blur), (whole.depth, folder.manifest.graphs.depth)):
-        weights = {
-            tensor.name.removeprefix(PREFIX): torch.from_numpy(numpy_helper.to_array(tensor).copy())
-            for tensor in onnx.load(model / graph.file).graph.initializer
-            if tensor.name.startswith(PREFIX)
-        }
-        wanted = network.state_dict()
-        try:
-            network.load_state_dict({name: weights[name] for name in wanted})
-        except (KeyError, RuntimeError) as exc:
-            raise ValueError(f"{model / graph.file} is no folded graph of the compact pair") from exc
+    weights = _weights(model)
+    try:
+        pair = make_pair("compact", Widths.of(weights))
+        pair.modules().eval()
+        whole = folded(pair)
+        whole.modules().load_state_dict({name: weights[name] for name in whole.modules().state_dict()})
+    except (IndexError, KeyError, RuntimeError) as exc:
+        raise ValueError(f"{model} has no folded graphs of the compact pair") from exc
     own_layers, layers = (_normed(either) for either in (pair, whole))
     with torch.no_grad():
         for own, other in zip(own_layers, layers, strict=True):
             own.ways.load_state_dict(other.ways.state_dict(), strict=False)
-            norm = _norm(own)
+            norm = batch_norm(own)
             norm.weight.fill_((1 + norm.eps) ** 0.5)
             norm.bias.copy_(other.convolutions()[-1].get_parameter("bias"))
     for head, shipped in zip(_heads(pair), _heads(whole), strict=True):
@@ -49,15 +42,19 @@ def restored(model: Path) -> Pair:
     return pair
 
 
+def _weights(model: Path) -> dict[str, Tensor]:
+    """What the graphs of a folder hold, by the names of ``Pair.modules()``."""
+    graphs = load_model_folder(model).manifest.graphs
+    return {
+        f"{network}.{tensor.name.removeprefix(PREFIX)}": torch.from_numpy(numpy_helper.to_array(tensor).copy())
+        for network, graph in (("blur", graphs.blur), ("depth", graphs.depth))
+        for tensor in onnx.load(model / graph.file).graph.initializer
+        if tensor.name.startswith(PREFIX)
+    }
+
+
 def _normed(pair: Pair) -> list[Normed]:
     return [module for module in pair.modules().modules() if isinstance(module, Normed)]
-
-
-def _norm(normed: Normed) -> nn.BatchNorm2d:
-    norm = normed.norm
-    if not isinstance(norm, nn.BatchNorm2d):
-        raise TypeError("these batch norms are folded away")
-    return norm
 
 
 def _heads(pair: Pair) -> list[nn.Module]:
@@ -70,7 +67,7 @@ def spread_norms(pair: Pair, passes: Iterable[Callable[[], object]]) -> None:
     Each pass runs the pair, in evaluation mode, on other pictures.
     """
     layers = _normed(pair)
-    seen: dict[nn.Module, list[Tensor]] = {_norm(layer): [] for layer in layers}
+    seen: dict[nn.Module, list[Tensor]] = {batch_norm(layer): [] for layer in layers}
 
     def look(norm: nn.Module, inputs: tuple[Tensor, ...]) -> None:
         maps = inputs[0].double()
@@ -83,7 +80,7 @@ def spread_norms(pair: Pair, passes: Iterable[Callable[[], object]]) -> None:
     for hook in hooks:
         hook.remove()
     for layer in layers:
-        norm, convolutions = _norm(layer), layer.convolutions()
+        norm, convolutions = batch_norm(layer), layer.convolutions()
         mean, square = torch.stack(seen[norm]).mean(0)
         filters = torch.cat([convolution.weight.detach().flatten(1) for convolution in convolutions], 1)
         length = filters.norm(dim=1).clamp_min(LEAST_LENGTH)

@@ -25,8 +25,9 @@ from torch.utils.data import DataLoader, Dataset
 
 from model_export.config import Kind, SceneConfig, TrainConfig
 from model_export.cores import torch_threads
+from model_export.folded import folded
 from model_export.losses import Batch, run_pair, total_loss
-from model_export.networks import Pair, make_pair
+from model_export.networks import SHIPPED_WIDTHS, Pair, Widths, make_pair
 from model_export.optimizers import Optimizers
 from model_export.progress import progress_bar
 from model_export.restored import restored, spread_norms
@@ -184,7 +185,7 @@ class Checkpoint:
 
     def pair(self) -> Pair:
         """The networks with this checkpoint's weights, in evaluation mode."""
-        pair = make_pair(self.config.kind)
+        pair = make_pair(self.config.kind, Widths.of(self.modules))
         pair.modules().load_state_dict(self.modules)
         pair.modules().eval()
         return pair
@@ -220,13 +221,20 @@ def computes_bfloat16(device: torch.device) -> bool:
 class Trainer:
     """Networks, optimiser and step of one run on one device."""
 
-    def __init__(self, config: TrainConfig, device: str, resume: Checkpoint | None = None) -> None:
+    def __init__(
+        self,
+        config: TrainConfig,
+        device: str,
+        resume: Checkpoint | None = None,
+        widths: Widths = SHIPPED_WIDTHS,
+    ) -> None:
         torch.manual_seed(config.seed)
         self.config, self.device = config, torch.device(device)
-        self.pair = make_pair(config.kind)
+        self.pair = make_pair(config.kind, widths if resume is None else Widths.of(resume.modules))
         self.modules = self.pair.modules().to(self.device)
         convert_conv2d_weight_memory_format(self.modules, torch.channels_last)
         self.optimizers = Optimizers(self.modules, config.weight_decay)
+        self.teacher: Pair | None = None
         self.step = 0
         if resume is not None:
             if not resume.optimizers:
@@ -239,6 +247,11 @@ class Trainer:
         """Take over other networks' weights."""
         self.modules.load_state_dict(pair.modules().state_dict())
 
+    def learn_from(self, teacher: Pair) -> None:
+        """Have what a batch costs include how far the answers are from another pair's."""
+        self.teacher = folded(teacher)
+        convert_conv2d_weight_memory_format(self.teacher.modules().to(self.device), torch.channels_last)
+
     def autocast(self) -> torch.autocast:
         """bfloat16 where the hardware computes it; emulated on an older processor it is ten times slower."""
         return torch.autocast(self.device.type, torch.bfloat16, enabled=computes_bfloat16(self.device))
@@ -250,7 +263,7 @@ class Trainer:
             for norm in self._norms():
                 norm.eval()
         with self.autocast():
-            loss, parts = total_loss(self.pair, batch, self.config)
+            loss, parts = total_loss(self.pair, batch, self.config, self.teacher)
         self.modules.zero_grad(set_to_none=True)
         torch.autograd.backward(loss)
         torch.nn.utils.clip_grad_norm_(self.modules.parameters(), self.config.clip_norm)
@@ -282,7 +295,7 @@ class Trainer:
         """The loss's parts on held-out scenes, networks in evaluation mode."""
         self.modules.eval()
         with torch.inference_mode(), self.autocast():
-            _, parts = total_loss(self.pair, batch, self.config)
+            _, parts = total_loss(self.pair, batch, self.config, self.teacher)
         return {name: float(part) for name, part in parts.items()}
 
     def checkpoint(self) -> Checkpoint:
@@ -314,14 +327,16 @@ def train(
     run: Path,
     *,
     weights: Path | None = None,
+    teacher: Path | None = None,
     workers: int = 1,
     device: str = "cpu",
     console: Console | None = None,
 ) -> Path:
     """Train in folder ``run``, going on from its checkpoint if there is one; the path of the last checkpoint.
 
-    A run without a checkpoint begins with the ``weights`` of a checkpoint or a model folder, or with random ones. Torch
-    computes on the cores that ``workers`` leave, so other workers are another run by rounding.
+    A run without a checkpoint begins with the ``weights`` of a checkpoint or a model folder, or with random ones. A
+    ``teacher``, either too, is one whose answers are learned beside the truth. Torch computes on the cores that
+    ``workers`` leave, so other workers are another run by rounding.
     Raises ``ValueError`` for weights of another kind.
     """
     console = console or Console(stderr=True)
@@ -330,6 +345,8 @@ def train(
     path = run / "checkpoint.pt"
     trainer, start = _opened(config, path, weights, device)
     config = trainer.config
+    if teacher is not None:
+        trainer.learn_from(starting_pair(teacher, config.kind))
     pool = Pool(config, photographs, trainer.step, workers)
     test = held_out(config.scenes, photographs, 2 * config.batch)
     # two busy processes on one core cost each far more than half its speed
@@ -368,7 +385,9 @@ def _opened(config: TrainConfig, path: Path, weights: Path | None, device: str) 
         return Trainer(replace(config, settled_share=resume.config.settled_share), device, resume), None
     if weights is None:
         return Trainer(config, device), None
-    return Trainer(replace(config, settled_share=1.0), device), starting_pair(weights, config.kind)
+    start = starting_pair(weights, config.kind)
+    widths = Widths.of(start.modules().state_dict())
+    return Trainer(replace(config, settled_share=1.0), device, widths=widths), start
 
 
 def _report(trainer: Trainer, recent: list[dict[str, float]], test: Batch, pace: Pace) -> str:

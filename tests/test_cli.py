@@ -122,3 +122,17 @@ def test_a_folder_without_a_calibration_says_why(tmp_path: Path) -> None:
     grey = camind(tmp_path, "calibrate", str(tmp_path / "photos"), "--out", str(tmp_path / "grey.json"))
     assert grey.returncode == 1
     assert "no result: the circles could be measured in none of the photographs" in grey.stdout
+
+
+@pytest.mark.parametrize(
+    ("blur", "said"),
+    [("16-many", "not 16-many"), ("16-900-48-96", "become fewer")],
+)
+def test_channels_that_cannot_become_fewer_are_said(tmp_path: Path, blur: str, said: str) -> None:
+    cv2.imwrite(str(tmp_path / "grey.png"), np.full((300, 400, 3), 128, np.uint8))
+    told = ["--textures", str(tmp_path), "--out", str(tmp_path / "narrow.pt"), "--blur", blur, "--depth", "16-16-16-48"]
+    refused = camind(tmp_path, "narrow", *told)
+    assert refused.returncode == 1
+    assert said in refused.stderr
+    assert "Traceback" not in refused.stderr
+    assert not (tmp_path / "narrow.pt").exists()

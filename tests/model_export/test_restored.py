@@ -56,5 +56,5 @@ def test_in_training_mode_the_norms_see_what_they_were_set_to(batch: Batch) -> N
 
 
 def test_another_kind_of_folder_is_refused() -> None:
-    with pytest.raises(ValueError, match="no folded graph"):
+    with pytest.raises(ValueError, match="no folded graphs"):
         restored(SHIPPED / "int8")

@@ -17,7 +17,7 @@ from model_export.config import SceneConfig, TrainConfig
 from model_export.cores import torch_threads
 from model_export.folded import folded
 from model_export.losses import run_pair, total_loss
-from model_export.networks import make_pair
+from model_export.networks import Widths, make_pair
 from model_export.restored import restored, spread_norms
 from model_export.scenes import draw_sample
 from model_export.textures import load_photographs
@@ -97,8 +97,8 @@ def test_a_new_run_begins_with_the_weights_it_is_told(textures: Path, tmp_path: 
 
 def test_a_new_run_goes_on_from_a_model_folder() -> None:
     batch = collate([draw_sample(seed, SCENES, []) for seed in range(2)], np.random.default_rng(0))
-    trainer = Trainer(CONFIG, "cpu")
     start = starting_pair(SHIPPED, "compact")
+    trainer = Trainer(CONFIG, "cpu", widths=Widths.of(start.modules().state_dict()))
     spread_norms(start, [partial(run_pair, start, batch)])
     trainer.begin_with(start)
     begun, shipped = folded(trainer.pair).modules(), folded(restored(SHIPPED)).modules()
@@ -178,6 +178,26 @@ def test_a_few_steps_on_one_batch_lower_the_loss() -> None:
     trainer = Trainer(config, "cpu")
     losses = [trainer.advance(batch)["loss"] for _ in range(25)]
     assert np.mean(losses[-5:]) < np.mean(losses[:5])
+
+
+def test_who_has_a_teacher_comes_to_answer_alike() -> None:
+    batch = collate([draw_sample(seed, SCENES, []) for seed in range(4)], np.random.default_rng(0))
+    torch.manual_seed(5)
+    teacher = make_pair("compact")
+    teacher.modules().eval()
+
+    def apart(trainer: Trainer) -> float:
+        with torch.inference_mode():
+            own, wise = (run_pair(pair, batch)[0].blur_px for pair in (trainer.pair, teacher))
+        return float((own / wise).log().abs().mean())
+
+    alone, taught = (Trainer(replace(CONFIG, steps=1000, settled_share=1.0), "cpu") for _ in range(2))
+    taught.learn_from(teacher)
+    before = apart(taught)
+    for _ in range(25):
+        alone.advance(batch)
+        taught.advance(batch)
+    assert apart(taught) < min(0.7 * before, apart(alone))
 
 
 def test_the_learning_rate_warms_up_holds_and_falls_to_nothing() -> None:
