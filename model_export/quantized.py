@@ -1,4 +1,4 @@
-"""The pair in int8: U8S8, per channel, with the front ends and the last convolutions in float32.
+"""The pair in int8: U8S8, per channel; front ends, what sees their energies, and the last convolutions stay in float32.
 
 Weights have seven bits (``reduce_range``), because AVX2 without integer dot products adds pairs of products in sixteen.
 """
@@ -31,6 +31,7 @@ FIRST_SEED = 2**41  # neither a training's nor a held-out scene's
 QUANTISED = ("Conv", "Relu", "MaxPool", "Resize", "Add")
 FIRST = "network.unet.encoder.0.layers.0."
 IMAGE = "unet.encoder.0.layers.0.ways.0"
+ENERGIES = "network.unet.encoder.0.layers.0.ways.1."
 
 Feeds = dict[str, NDArray[np.float32]]
 
@@ -80,7 +81,7 @@ def quantised_graphs(pair: Pair, folder: Path) -> Graphs:
         graphs = export_graphs(through_cells(pair), Path(scratch))
         blur, depth = zip(*_scene_feeds(pair, graphs.feature_names), strict=True)
         return Graphs(
-            blur=_quantised(graphs.blur, Path(scratch), list(blur), folder),
+            blur=_quantised(graphs.blur, Path(scratch), list(blur), folder, in_float=ENERGIES),
             depth=_quantised(graphs.depth, Path(scratch), list(depth), folder),
         )
 
@@ -94,7 +95,9 @@ def _scene_feeds(pair: Pair, feature_names: tuple[str, ...]) -> Iterator[tuple[F
         yield {"image": image}, through_torch(pair, image, camera, feature_names)[1]
 
 
-def _quantised(graph: GraphFile, scratch: Path, feeds: list[Feeds], folder: Path) -> GraphFile:
+def _quantised(
+    graph: GraphFile, scratch: Path, feeds: list[Feeds], folder: Path, in_float: str | None = None
+) -> GraphFile:
     prepared = scratch / f"prepared-{graph.file}"
     quant_pre_process(scratch / graph.file, prepared, skip_symbolic_shape=True)
     level = logging.root.level
@@ -109,7 +112,7 @@ def _quantised(graph: GraphFile, scratch: Path, feeds: list[Feeds], folder: Path
             weight_type=QuantType.QInt8,
             per_channel=True,
             reduce_range=True,
-            nodes_to_quantize=_from_first_to_last(onnx.load(prepared)),
+            nodes_to_quantize=_from_first_to_last(onnx.load(prepared), in_float),
         )
     finally:
         logging.root.setLevel(level)
@@ -117,10 +120,11 @@ def _quantised(graph: GraphFile, scratch: Path, feeds: list[Feeds], folder: Path
     return graph.model_copy(update={"sha256": sha256_of(folder / graph.file)})
 
 
-def _from_first_to_last(model: onnx.ModelProto) -> list[str]:
-    """Nodes from the first convolution of the network up to its last, which is not among them."""
+def _from_first_to_last(model: onnx.ModelProto, in_float: str | None) -> list[str]:
+    """Nodes from the first convolution of the network up to its last, but for that one and the one named."""
     nodes = list(model.graph.node)
     kernels = {i: node.input[1] for i, node in enumerate(nodes) if node.op_type == "Conv"}
     first = min(i for i, name in kernels.items() if name.startswith(FIRST))
-    inner = nodes[first : max(kernels)]
+    left = {i for i, name in kernels.items() if in_float is not None and name.startswith(in_float)}
+    inner = (node for i, node in enumerate(nodes) if first <= i < max(kernels) and i not in left)
     return [node.name for node in inner if node.op_type in QUANTISED]
