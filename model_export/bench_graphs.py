@@ -16,6 +16,7 @@ import onnxruntime
 import torch
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
+from threadpoolctl import threadpool_limits
 from torch.nn.utils import convert_conv2d_weight_memory_format
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -207,7 +208,7 @@ def machine_rates(threads: int, rounds: int, on_round: Callable[[], None] = lamb
             _session(_integer_convolution_graph(weight), {"x": (maps * 200).astype(np.uint8)}, threads),
         ),
     }
-    with torch_threads(threads), torch.inference_mode():
+    with torch_threads(threads), threadpool_limits(threads, "blas"), torch.inference_mode():
         timings = in_turns({key: work for key, (_, work) in works.items()}, rounds, on_round)
     return [Rate(*key, threads, operations / min(timings[key].seconds) / 1e9) for key, (operations, _) in works.items()]
 
@@ -221,6 +222,7 @@ def _session(graph: onnx.GraphProto, feeds: Mapping[str, NDArray[np.generic]], t
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=10)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # it would take the others' cores
     session = onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
     return lambda: session.run(None, feeds)
 
