@@ -343,10 +343,8 @@ def train(
     photographs = load_photographs(textures)
     run.mkdir(parents=True, exist_ok=True)
     path = run / "checkpoint.pt"
-    trainer, start = _opened(config, path, weights, device)
+    trainer, start = _opened(config, path, weights, teacher, device)
     config = trainer.config
-    if teacher is not None:
-        trainer.learn_from(starting_pair(teacher, config.kind))
     pool = Pool(config, photographs, trainer.step, workers)
     test = held_out(config.scenes, photographs, 2 * config.batch)
     # two busy processes on one core cost each far more than half its speed
@@ -375,19 +373,25 @@ def train(
     return path
 
 
-def _opened(config: TrainConfig, path: Path, weights: Path | None, device: str) -> tuple[Trainer, Pair | None]:
+def _opened(
+    config: TrainConfig, path: Path, weights: Path | None, teacher: Path | None, device: str
+) -> tuple[Trainer, Pair | None]:
     """The trainer of a run, as its checkpoint left it if there is one, and the networks that a new run begins with.
 
     With such networks the norms' statistics stay as they are: a batch's own would undo much of what was learned.
     """
-    if path.exists():
-        resume = Checkpoint.load(path)
-        return Trainer(replace(config, settled_share=resume.config.settled_share), device, resume), None
-    if weights is None:
-        return Trainer(config, device), None
-    start = starting_pair(weights, config.kind)
-    widths = Widths.of(start.modules().state_dict())
-    return Trainer(replace(config, settled_share=1.0), device, widths=widths), start
+    resume = Checkpoint.load(path) if path.exists() else None
+    start = starting_pair(weights, config.kind) if weights is not None and resume is None else None
+    if resume is not None:
+        trainer = Trainer(replace(config, settled_share=resume.config.settled_share), device, resume)
+    elif start is not None:
+        widths = Widths.of(start.modules().state_dict())
+        trainer = Trainer(replace(config, settled_share=1.0), device, widths=widths)
+    else:
+        trainer = Trainer(config, device)
+    if teacher is not None:
+        trainer.learn_from(starting_pair(teacher, config.kind))
+    return trainer, start
 
 
 def _report(trainer: Trainer, recent: list[dict[str, float]], test: Batch, pace: Pace) -> str:
