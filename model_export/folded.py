@@ -6,7 +6,7 @@ from dataclasses import replace
 import torch
 from torch import nn
 
-from model_export.networks import Normed, Pair, batch_norm
+from model_export.networks import Normed, Pair, batch_norm, norm_gain
 
 
 def folded(pair: Pair) -> Pair:
@@ -21,10 +21,9 @@ def folded(pair: Pair) -> Pair:
 
 def _fold(normed: Normed) -> None:
     norm = batch_norm(normed)
-    mean, variance = norm.get_buffer("running_mean"), norm.get_buffer("running_var")
     with torch.no_grad():
-        gain = norm.weight / (variance + norm.eps).sqrt()
+        gain = norm_gain(norm)
         for convolution in normed.convolutions():
             convolution.weight.mul_(gain[:, None, None, None])
-        normed.convolutions()[-1].bias = nn.Parameter(norm.bias - gain * mean)
+        normed.convolutions()[-1].bias = nn.Parameter(norm.bias - gain * norm.get_buffer("running_mean"))
     normed.norm = nn.Identity()

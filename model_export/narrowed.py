@@ -8,7 +8,7 @@ ThiNet, Luo et al. 2017, chooses channels). Training goes on from there.
 import copy
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ from torch.nn import functional
 from model_export.config import TrainConfig
 from model_export.cores import torch_threads
 from model_export.losses import Batch, run_pair
-from model_export.networks import Normed, Pair, Widths, batch_norm, make_pair
+from model_export.networks import Normed, Pair, Widths, batch_norm, make_pair, norm_gain
 from model_export.progress import progress_bar
 from model_export.restored import restored, spread_norms
 from model_export.textures import load_photographs
@@ -49,12 +49,8 @@ class _View:
 
     def left_unsaid(self, kept: list[int]) -> float:
         """What part of that which the layer makes of the map does not follow from the kept channels."""
-        left = self._left(kept)
-        moments = self._scaled()
+        left, moments, weights = self._left(kept), self._seen, self._weights
         rest = moments[left][:, left] - moments[left][:, [*kept, -1]] @ self._sums(kept)
-        gain = self.norm.weight / (self.norm.get_buffer("running_var") + self.norm.eps).sqrt()
-        kernels = (self.kernels.weight * gain[:, None, None, None]).detach().double()
-        weights = torch.einsum("oikl,ojkl->ij", kernels, kernels)
         return float((weights[left][:, left] * rest).sum() / (weights * moments[:-1, :-1]).sum())
 
     def see(self, kept: list[int]) -> None:
@@ -68,12 +64,20 @@ class _View:
     def _left(self, kept: list[int]) -> list[int]:
         return sorted(set(range(len(self._moments) - 1)) - set(kept))
 
-    def _scaled(self) -> Tensor:
+    @cached_property
+    def _weights(self) -> Tensor:
+        """How what the layer makes weighs products of channels [c,c]."""
+        kernels = (self.kernels.weight * norm_gain(self.norm)[:, None, None, None]).detach().double()
+        return torch.einsum("oikl,ojkl->ij", kernels, kernels)
+
+    @cached_property
+    def _seen(self) -> Tensor:
+        """The mean moments, once all was looked at [c+1,c+1]."""
         return self._moments / self._moments[-1, -1] + RIDGE * torch.eye(len(self._moments))
 
     def _sums(self, kept: list[int]) -> Tensor:
         """The channels left out by the kept ones and a constant [k+1,left]."""
-        moments, given = self._scaled(), [*kept, -1]
+        moments, given = self._seen, [*kept, -1]
         sums: Tensor = torch.linalg.solve(moments[given][:, given], moments[given][:, self._left(kept)])
         return sums
 

@@ -217,6 +217,12 @@ def batch_norm(normed: Normed) -> nn.BatchNorm2d:
     return normed.norm
 
 
+def norm_gain(norm: nn.BatchNorm2d) -> Tensor:
+    """What a batch norm multiplies each channel with in evaluation mode [c]."""
+    gain: Tensor = norm.weight / (norm.get_buffer("running_var") + norm.eps).sqrt()
+    return gain
+
+
 class Block(nn.Module):
     """Normed convolutions, a ReLU after each; the first may see several maps."""
 

@@ -81,7 +81,7 @@ def quantised_graphs(pair: Pair, folder: Path) -> Graphs:
         graphs = export_graphs(through_cells(pair), Path(scratch))
         blur, depth = zip(*_scene_feeds(pair, graphs.feature_names), strict=True)
         return Graphs(
-            blur=_quantised(graphs.blur, Path(scratch), list(blur), folder, in_float=ENERGIES),
+            blur=_quantised(graphs.blur, Path(scratch), list(blur), folder, in_float=(ENERGIES,)),
             depth=_quantised(graphs.depth, Path(scratch), list(depth), folder),
         )
 
@@ -96,7 +96,7 @@ def _scene_feeds(pair: Pair, feature_names: tuple[str, ...]) -> Iterator[tuple[F
 
 
 def _quantised(
-    graph: GraphFile, scratch: Path, feeds: list[Feeds], folder: Path, in_float: str | None = None
+    graph: GraphFile, scratch: Path, feeds: list[Feeds], folder: Path, in_float: tuple[str, ...] = ()
 ) -> GraphFile:
     prepared = scratch / f"prepared-{graph.file}"
     quant_pre_process(scratch / graph.file, prepared, skip_symbolic_shape=True)
@@ -120,11 +120,11 @@ def _quantised(
     return graph.model_copy(update={"sha256": sha256_of(folder / graph.file)})
 
 
-def _from_first_to_last(model: onnx.ModelProto, in_float: str | None) -> list[str]:
-    """Nodes from the first convolution of the network up to its last, but for that one and the one named."""
+def _from_first_to_last(model: onnx.ModelProto, in_float: tuple[str, ...]) -> list[str]:
+    """Nodes from the first convolution of the network up to its last, but for that one and those named."""
     nodes = list(model.graph.node)
     kernels = {i: node.input[1] for i, node in enumerate(nodes) if node.op_type == "Conv"}
     first = min(i for i, name in kernels.items() if name.startswith(FIRST))
-    left = {i for i, name in kernels.items() if in_float is not None and name.startswith(in_float)}
-    inner = (node for i, node in enumerate(nodes) if first <= i < max(kernels) and i not in left)
-    return [node.name for node in inner if node.op_type in QUANTISED]
+    left = {nodes[i].name for i, name in kernels.items() if name.startswith(in_float)}
+    inner = nodes[first : max(kernels)]
+    return [node.name for node in inner if node.op_type in QUANTISED and node.name not in left]

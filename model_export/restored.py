@@ -9,7 +9,7 @@ from onnx import numpy_helper
 from torch import Tensor, nn
 
 from model_export.folded import folded
-from model_export.networks import Normed, Pair, Widths, batch_norm, make_pair
+from model_export.networks import Normed, Pair, Widths, batch_norm, make_pair, norm_gain
 from service.inference.artifact import load_model_folder
 
 PREFIX = "network."
@@ -85,7 +85,7 @@ def spread_norms(pair: Pair, passes: Iterable[Callable[[], object]]) -> None:
         filters = torch.cat([convolution.weight.detach().flatten(1) for convolution in convolutions], 1)
         length = filters.norm(dim=1).clamp_min(LEAST_LENGTH)
         variance = (square - mean**2).clamp_min(0).float() / length**2
-        gain = norm.weight / (norm.get_buffer("running_var") + norm.eps).sqrt()
+        gain = norm_gain(norm)
         with torch.no_grad():
             norm.bias.add_(gain * (mean.float() - norm.get_buffer("running_mean")))
             norm.weight.copy_(gain * length * (variance + norm.eps).sqrt())
