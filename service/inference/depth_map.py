@@ -26,7 +26,7 @@ Array = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What one copy of the photograph says at its cells, with the camera at that copy's size.
+    """What the photograph says at the cells of the copy that was read, with the camera at that copy's size.
 
     ``depth_m`` is the answer of both hypotheses together, ``other_m`` the less likely one: NaN where blur is too strong
     for a far one by more than two standard deviations (beyond focus x stays below 1). ``error`` is that of depth,
@@ -45,12 +45,18 @@ class Reading:
 
     @classmethod
     def of(
-        cls, maps: RawMaps, camera: Camera, photograph_size: tuple[int, int], manifest: Manifest, side: Side
+        cls,
+        maps: RawMaps,
+        camera: Camera,
+        photograph_size: tuple[int, int],
+        manifest: Manifest,
+        side: Side,
+        most_blur_px: float,
     ) -> Self:
         """``photograph_size`` is (height, width). The maps are taken over and written over: they may be large.
 
         Where the side is given its hypothesis is the answer, but near where no far one can exist. No error is stated
-        below the floor of optics.
+        below the floor of optics, and nothing answered of more blur than ``most_blur_px``, in pixels of the copy.
         """
         blur_px, p_near = maps["blur_px"], maps["p_near"]
         depth_m, other_m, error = maps["log_ratio_near"], maps["log_ratio_far"], maps["log_scale"]
@@ -70,7 +76,7 @@ class Reading:
             own = np.exp(error[rows]) * (SIGMA_OF_LAPLACE * temperature)
             answer_m, deviation, is_far = merged(near_m, far_m, p_near[rows], own)
             least = np.float32(floor) * answer_m
-            is_known = (np.fmax(own, least) <= MAX_RELATIVE_ERROR) & (blur_px[rows] <= manifest.ranges.blur_px.high)
+            is_known = (np.fmax(own, least) <= MAX_RELATIVE_ERROR) & (blur_px[rows] <= most_blur_px)
             is_known &= (nearest * focus_m <= answer_m) & (answer_m <= farthest * focus_m)
             depth_m[rows] = answer_m
             other_m[rows] = np.where(is_far, near_m, np.where(has_far, far_m, np.float32(np.nan)))
@@ -159,24 +165,24 @@ class DepthMap:
         return float(self.valid.mean())
 
 
-def decide(readings: list[Reading], size: tuple[int, int]) -> tuple[Array, NDArray[np.bool_]]:
-    """Depth (height, width) and which pixels have an answer; the surest reading wins, pixel by pixel."""
+def decide(reading: Reading, size: tuple[int, int]) -> tuple[Array, NDArray[np.bool_]]:
+    """Depth (height, width) and which pixels have an answer."""
     depth_m, valid = np.empty(size, np.float32), np.empty(size, np.bool_)
     for rows in bands(size):
-        error, depth_m[rows] = _surest(readings, rows, size[1], "depth_m")
+        depth_m[rows], error = _sampled(reading, rows, size[1], "depth_m", "error")
         valid[rows] = error <= MAX_RELATIVE_ERROR
     depth_m[~valid] = np.nan
     return depth_m, valid
 
 
-def all_layers(readings: list[Reading], size: tuple[int, int]) -> Callable[[], Layers]:
+def all_layers(reading: Reading, size: tuple[int, int]) -> Callable[[], Layers]:
     """What makes all maps when first called, and gives the same ones after."""
 
     @cache
     def made() -> Layers:
         layers = Layers(*(np.empty(size, np.float32) for _ in Layers.__slots__))
         for rows in bands(size):
-            error, *maps = _surest(readings, rows, size[1], "depth_m", "other_m", "p_near", "blur_px")
+            error, *maps = _sampled(reading, rows, size[1], "error", "depth_m", "other_m", "p_near", "blur_px")
             layers.depth_m[rows], layers.depth_alt_m[rows], layers.p_near[rows], layers.blur_px[rows] = maps
             layers.sigma_m[rows] = error * maps[0]
             for hidden in (layers.depth_m, layers.depth_alt_m, layers.sigma_m):
@@ -186,14 +192,5 @@ def all_layers(readings: list[Reading], size: tuple[int, int]) -> Callable[[], L
     return made
 
 
-def _surest(readings: list[Reading], rows: slice, width: int, *names: str) -> list[Array]:
-    """The errors at those rows, and the named maps of the reading that is surest at each pixel."""
-    told, *others = (
-        [sample(getattr(reading, name), reading.ratio, rows, width) for name in ("error", *names)]
-        for reading in readings
-    )
-    for other in others:
-        is_surer = other[0] < told[0]
-        for mine, theirs in zip(told, other, strict=True):
-            np.copyto(mine, theirs, where=is_surer)
-    return told
+def _sampled(reading: Reading, rows: slice, width: int, *names: str) -> list[Array]:
+    return [sample(getattr(reading, name), reading.ratio, rows, width) for name in names]

@@ -34,7 +34,7 @@ LOG_DEPTH_SCALE = 0.02
 STRIDE = 2
 MULTIPLE = 16
 OPSET = 17
-BLUR_RANGE = Interval(0.3, 20.0)
+BLUR_RANGE = Interval(0.3, 60.0)
 
 
 def build_oracle_pair(

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from service.inference.artifact import ModelFolderError, load_model_folder, write_manifest
-from tests.inference.oracle_pair import build_oracle_pair
+from tests.inference.oracle_pair import BLUR_RANGE, build_oracle_pair
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def edit(folder: Path, change: dict[str, Any]) -> None:
 def test_an_intact_folder_is_read_back_as_written(folder: Path) -> None:
     loaded = load_model_folder(folder)
     assert loaded.manifest.graphs.feature_names == ("features_red",)
-    assert loaded.manifest.ranges.blur_px.high == 20
+    assert loaded.manifest.ranges.blur_px == BLUR_RANGE
     assert loaded.blur_graph.is_file()
     assert loaded.card().startswith("# Oracle")
     before = (folder / "manifest.json").read_bytes()
@@ -32,7 +32,7 @@ def test_an_intact_folder_is_read_back_as_written(folder: Path) -> None:
 
 
 def test_ranges_are_pairs_in_json(folder: Path) -> None:
-    assert json.loads((folder / "manifest.json").read_text())["ranges"]["blur_px"] == [0.3, 20.0]
+    assert json.loads((folder / "manifest.json").read_text())["ranges"]["blur_px"] == [0.3, 60.0]
 
 
 @pytest.mark.parametrize("name", ["blur.onnx", "depth.onnx", "MODEL_CARD.md"])

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from service.inference.artifact import Interval, load_model_folder
 from service.inference.cancellation import Cancellation, Cancelled
 from service.inference.depth_map import LEAST_BLUR_ERROR_PX, Reading, all_layers, decide
-from service.inference.estimator import Estimator
+from service.inference.estimator import SURROUNDINGS_PX, Estimator
 from service.inference.pair import MAPS, GraphPair, RawMaps, Side
 from service.inference.part import Part
-from service.inference.tiles import OVERLAP_PX
 from service.optics import thin_lens
 from service.optics.camera import Camera, Intrinsics
 from tests.inference.oracle_pair import LOG_DEPTH_SCALE, blur_of, brightness_for, build_oracle_pair
@@ -93,7 +92,7 @@ def test_blur_no_surer_than_that_may_lie_beyond_focus_all_the_same(
     blur_px = thin_lens.blur_from_defocus(x * CAMERA.k_cam_px, CAMERA.gamma_px)
     values = dict.fromkeys(MAPS, 1.0) | {"blur_px": blur_px, "blur_log_error": float(np.log(relative_error))}
     maps = {name: np.full((32, 48), value, np.float32) for name, value in values.items()}
-    reading = Reading.of(maps, CAMERA, (64, 96), load_model_folder(folder).manifest, "auto")
+    reading = Reading.of(maps, CAMERA, (64, 96), load_model_folder(folder).manifest, "auto", 20.0)
     assert np.isfinite(reading.other_m).all() == may_be_beyond
 
 
@@ -115,10 +114,10 @@ def test_the_side_is_the_one_that_is_off_by_less_on_average(
     values = dict.fromkeys(MAPS, 0.0) | {"blur_px": 2.0, "blur_log_error": -3.0, "p_near": p_near, "log_scale": -12.0}
     values |= {"log_ratio_near": np.log(near_m / 2), "log_ratio_far": np.log(far_m / 2)}
     maps = {name: np.full((32, 48), value, np.float32) for name, value in values.items()}
-    reading = Reading.of(maps, CAMERA, (64, 96), load_model_folder(folder).manifest, "auto")
+    reading = Reading.of(maps, CAMERA, (64, 96), load_model_folder(folder).manifest, "auto", 20.0)
     answer, other = (near_m, far_m) if is_near else (far_m, near_m)
-    np.testing.assert_allclose(decide([reading], (64, 96))[0], answer, rtol=1e-4)
-    layers = all_layers([reading], (64, 96))()
+    np.testing.assert_allclose(decide(reading, (64, 96))[0], answer, rtol=1e-4)
+    layers = all_layers(reading, (64, 96))()
     np.testing.assert_allclose(layers.depth_alt_m, other, rtol=1e-4)
     np.testing.assert_allclose(layers.p_near, p_near, rtol=1e-4)
 
@@ -127,9 +126,9 @@ def test_doubt_between_depths_far_apart_is_said_and_still_an_answer(folder: Path
     values = dict.fromkeys(MAPS, 0.0) | {"blur_px": 2.0, "blur_log_error": -3.0, "p_near": 0.4, "log_scale": -3.0}
     values |= {"log_ratio_near": np.log(0.2), "log_ratio_far": np.log(7.0)}
     maps = {name: np.full((32, 48), value, np.float32) for name, value in values.items()}
-    reading = Reading.of(maps, CAMERA, (64, 96), load_model_folder(folder).manifest, "auto")
-    assert decide([reading], (64, 96))[1].all()
-    layers = all_layers([reading], (64, 96))()
+    reading = Reading.of(maps, CAMERA, (64, 96), load_model_folder(folder).manifest, "auto", 20.0)
+    assert decide(reading, (64, 96))[1].all()
+    layers = all_layers(reading, (64, 96))()
     np.testing.assert_allclose(layers.sigma_m, layers.depth_m, rtol=0.01)
     assert (layers.sigma_m <= layers.depth_m).all()
 
@@ -160,11 +159,11 @@ def test_maps_are_aligned_with_the_photograph_to_a_fraction_of_a_pixel(estimator
 
 
 def test_a_large_k_cam_is_read_on_a_smaller_copy_and_reported(estimator: Estimator) -> None:
-    camera = Camera(600, 400, 2.0, 32.0, 0.5)
+    camera = Camera(600, 400, 2.0, 48.0, 0.5)
     answer = estimator.estimate(grey(100, 400, 600), camera, "near")
     assert answer.scales == (0.25,)
     working_blur = blur_of(100)
-    x = thin_lens.relative_defocus_from_blur(working_blur, camera.averaged(150, 100).gamma_px, 8.0)
+    x = thin_lens.relative_defocus_from_blur(working_blur, camera.averaged(150, 100).gamma_px, 12.0)
     np.testing.assert_allclose(answer.depth_m, thin_lens.depth_near(x, 2.0), rtol=1e-4)
     np.testing.assert_allclose(answer.blur_px, working_blur * 4, rtol=1e-4)
     assert "read at 0.25 of full size (150x100)" in answer.warnings
@@ -173,7 +172,7 @@ def test_a_large_k_cam_is_read_on_a_smaller_copy_and_reported(estimator: Estimat
 
 @pytest.mark.parametrize(
     ("width_px", "k_cam_px", "scale"),
-    [(640, 7.5, 1.0), (1600, 7.5, 5 / 7.5), (1600, 20.0, 0.4), (1600, 1.3, 1.0), (1280, 32.0, 0.25)],
+    [(640, 7.5, 1.0), (1600, 7.5, 5 / 7.5), (1600, 20.0, 0.4), (1600, 1.3, 1.0), (1280, 48.0, 0.25)],
 )
 def test_of_a_large_picture_a_copy_is_read_that_shows_much_at_a_time_and_enough_blur(
     estimator: Estimator, width_px: int, k_cam_px: float, scale: float
@@ -193,12 +192,48 @@ def test_a_small_copy_keeps_the_place_of_things(estimator: Estimator) -> None:
     assert abs(int(np.argmax(answer.blur_px[200] > middle)) - 300) <= 1
 
 
-def test_blur_beyond_one_scale_is_read_on_a_second_one(tmp_path: Path) -> None:
-    folder = build_oracle_pair(tmp_path / "model", blur_range=Interval(0.3, 8.0))
-    narrow = Estimator.from_folder(load_model_folder(folder))
-    answer = narrow.estimate(grey(200), CAMERA, "near")
-    assert answer.scales == pytest.approx((1, 1 / 3))
-    assert any(warning.startswith("read at 0.333") for warning in answer.warnings)
+@pytest.fixture(scope="module")
+def halving(tmp_path_factory: pytest.TempPathFactory) -> Estimator:
+    """It knows blur to 20 px, so that of 4 px and more is read on a copy of half the size."""
+    folder = build_oracle_pair(tmp_path_factory.mktemp("model"), blur_range=Interval(0.3, 20.0))
+    return Estimator.from_folder(load_model_folder(folder))
+
+
+@pytest.mark.parametrize("size", [(64, 96), (63, 101), (50, 203)])
+def test_strong_blur_is_read_on_a_copy_of_half_the_size(halving: Estimator, size: tuple[int, int]) -> None:
+    height, width = size
+    rgb = grey(brightness_for(1.8), height, width)
+    rgb[:, width // 2 :] = brightness_for(8.0)
+    camera = replace(CAMERA, image_width_px=width, image_height_px=height)
+    answer = halving.estimate(rgb, camera, "near")
+    assert answer.scales == pytest.approx((1, 0.5), rel=0.02)
+    copied = camera.averaged(round(width * 0.5), round(height * 0.5))
+    for columns, told, seen_by in (
+        (slice(0, width // 2 - 6), 1.8, camera),
+        (slice(width // 2 + 6, width), 8.0, copied),
+    ):
+        blur_px = blur_of(brightness_for(told))
+        np.testing.assert_allclose(answer.blur_px[:, columns], blur_px * width / seen_by.image_width_px, rtol=1e-4)
+        x = thin_lens.relative_defocus_from_blur(blur_px, seen_by.gamma_px, seen_by.k_cam_px)
+        np.testing.assert_allclose(answer.depth_m[:, columns], thin_lens.depth_near(x, 2.0), rtol=1e-4)
+
+
+def test_between_two_copies_no_step_shows(halving: Estimator) -> None:
+    ramp = np.linspace(brightness_for(1.0), brightness_for(6.0), 640).round().astype(np.uint8)
+    rgb = np.repeat(np.repeat(ramp[np.newaxis, :, np.newaxis], 64, axis=0), 3, axis=2)
+    answer = halving.estimate(rgb, replace(CAMERA, image_width_px=640), "near")
+    assert answer.scales == (1, 0.5)
+    steps = np.diff(np.log(answer.blur_px[32, 8:-8]))
+    assert steps.min() >= 0
+    assert steps.max() < 0.05  # the oracle reads a copy twice as blurred: a step would be ln 2
+
+
+@pytest.mark.parametrize(("blur_px", "k_cam_px"), [(3.9, 6.0), (8.0, 0.9)])
+def test_one_copy_is_read_where_no_blur_is_strong_or_the_model_knows_no_k_cam_of_half(
+    halving: Estimator, blur_px: float, k_cam_px: float
+) -> None:
+    picture = grey(brightness_for(blur_px))
+    assert halving.estimate(picture, replace(CAMERA, k_cam_px=k_cam_px), "near").scales == (1,)
 
 
 def test_what_lies_outside_the_trained_ranges_is_said(estimator: Estimator) -> None:
@@ -269,8 +304,8 @@ def test_a_part_is_read_with_its_surroundings_and_no_more(folder: Path, monkeypa
     assert (answer.width_px, answer.height_px) == (60, 30)
     assert (answer.camera.image_width_px, answer.camera.image_height_px) == (60, 30)
     ((height, width, _),) = seen
-    assert 60 + 2 * OVERLAP_PX <= width < 60 + 2 * OVERLAP_PX + 16
-    assert 30 + 2 * OVERLAP_PX <= height < 30 + 2 * OVERLAP_PX + 16
+    assert 60 + 2 * SURROUNDINGS_PX <= width < 60 + 2 * SURROUNDINGS_PX + 16
+    assert 30 + 2 * SURROUNDINGS_PX <= height < 30 + 2 * SURROUNDINGS_PX + 16
 
 
 def test_a_camera_of_another_size_is_refused(estimator: Estimator) -> None:
