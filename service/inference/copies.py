@@ -22,8 +22,4 @@ def blend(maps: RawMaps, coarse: RawMaps, ratio: Ratio, strong_px: float) -> Non
         least_px = np.minimum(told["blur_px"], maps["blur_px"][rows])
         share = np.clip(np.log2(least_px / np.float32(strong_px)), 0, 1)
         for name, values in maps.items():
-            mine = values[rows]
-            if name == "blur_px":
-                mine *= (told[name] / mine) ** share
-            else:
-                mine += share * (told[name] - mine)
+            values[rows] += share * (told[name] - values[rows])
