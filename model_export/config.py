@@ -28,7 +28,7 @@ class TrainConfig:
     """A training run: ``steps`` batches, drawn from a pool that ``fresh_per_step`` new scenes flow through.
 
     The last ``settled_share`` of the steps has the batch norms' statistics fixed, as the exported network has: all of
-    them in a run that begins with weights.
+    them in a run that begins with weights. A ``taught`` run learns a teacher's answers too.
     """
 
     kind: Kind = "compact"
@@ -42,6 +42,7 @@ class TrainConfig:
     clip_norm: float = 1.0
     b_weight: float = 1.0
     side_weight: float = 0.3
+    taught: bool = False
     likeness_weight: float = 10.0
     pool: int = 600
     fresh_per_step: float = 1.0

@@ -337,7 +337,7 @@ def train(
     A run without a checkpoint begins with the ``weights`` of a checkpoint or a model folder, or with random ones. A
     ``teacher``, either too, is one whose answers are learned beside the truth. Torch computes on the cores that
     ``workers`` leave, so other workers are another run by rounding.
-    Raises ``ValueError`` for weights of another kind.
+    Raises ``ValueError`` for weights of another kind, and for a run with a teacher that is gone on with without one.
     """
     console = console or Console(stderr=True)
     photographs = load_photographs(textures)
@@ -381,6 +381,10 @@ def _opened(
     With such networks the norms' statistics stay as they are: a batch's own would undo much of what was learned.
     """
     resume = Checkpoint.load(path) if path.exists() else None
+    if resume is not None and resume.config.taught != (teacher is not None):
+        how = "with" if resume.config.taught else "without"
+        raise ValueError(f"{path.parent} was begun {how} a --teacher: go on {how} one")
+    config = replace(config, taught=teacher is not None)
     start = starting_pair(weights, config.kind) if weights is not None and resume is None else None
     if resume is not None:
         trainer = Trainer(replace(config, settled_share=resume.config.settled_share), device, resume)

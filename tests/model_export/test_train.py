@@ -214,3 +214,12 @@ def test_a_config_survives_json() -> None:
 def test_a_folder_without_pictures_is_said(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="no JPEG or PNG"):
         train(CONFIG, tmp_path, tmp_path / "run", workers=0)
+
+
+def test_a_run_that_began_with_a_teacher_goes_on_with_one(textures: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    path = train(replace(CONFIG, steps=3), textures, folder, teacher=SHIPPED, workers=0)
+    assert Checkpoint.load(path).config.taught
+    with pytest.raises(ValueError, match="begun with a --teacher: go on with one"):
+        train(CONFIG, textures, folder, workers=0)
+    assert Checkpoint.load(train(CONFIG, textures, folder, teacher=SHIPPED, workers=0)).step == CONFIG.steps
