@@ -26,6 +26,7 @@ WIDE_PX, FINE_K_CAM_PX = 640, 5.0
 # where it is half as blurred and more of its surroundings is seen: table tops by k_cam 2.64 to 10.7 px to 0.126, 0.125,
 # 0.122, 0.122 m for 0.137, 0.140, 0.139, 0.156, indoor frames as before
 STRONG_BLUR = 0.2
+STRONG_FRACTION = 1e-3  # of the picture: a few cells' noise is not worth the time, and in them alone a part may differ
 COARSER = 0.5
 # how much around a part is read with it: such a copy sees twice as far as a tile of the picture. Of parts of 1920x1440
 # that show blur of 4 to 20 px one pixel in 13 is off by 1.5 % or more from the whole's answer, in 8 with 224 px
@@ -141,7 +142,7 @@ class Estimator:
         ranges = self.manifest.ranges
         if camera.k_cam_px * COARSER < ranges.k_cam_px.low:
             return False
-        return float(maps["blur_px"].max()) > STRONG_BLUR * ranges.blur_px.high
+        return float((maps["blur_px"] > STRONG_BLUR * ranges.blur_px.high).mean()) > STRONG_FRACTION
 
     def _read(
         self, rgb: NDArray[np.uint8], working: Camera, side: Side, cancellation: Cancellation, stopwatch: Stopwatch

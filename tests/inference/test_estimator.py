@@ -236,6 +236,14 @@ def test_one_copy_is_read_where_no_blur_is_strong_or_the_model_knows_no_k_cam_of
     assert halving.estimate(picture, replace(CAMERA, k_cam_px=k_cam_px), "near").scales == (1,)
 
 
+def test_a_few_cells_of_strong_blur_are_not_worth_a_second_copy(halving: Estimator) -> None:
+    picture = grey(brightness_for(1.0))
+    picture[20:22, 40:42] = brightness_for(8.0)
+    assert halving.estimate(picture, CAMERA, "near").scales == (1,)
+    picture[20:24, 40:44] = brightness_for(8.0)
+    assert halving.estimate(picture, CAMERA, "near").scales == (1, 0.5)
+
+
 def test_what_lies_outside_the_trained_ranges_is_said(estimator: Estimator) -> None:
     camera = Camera(96, 64, 30.0, 0.2, 3.0, intrinsics=Intrinsics(20, 20, 48, 32))
     told = " / ".join(estimator.estimate(grey(60), camera).warnings)
