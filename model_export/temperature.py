@@ -14,8 +14,8 @@ FIRST = 2**20  # far from the scenes that evaluation draws
 HELD = ((1, 0.68), (2, 0.95))  # what intervals of so many deviations should hold
 DECIMALS = 3
 # other pictures are stranger to a network than scenes of the kind it was trained on: with the side told their errors
-# were 0.93 (a real lens), 0.97 to 1.17 (refocused frames and table tops), 1.34 (ray-traced rooms) times those stated for
-# scenes
+# were 0.93 (a real lens), 0.97 to 1.17 (refocused frames and table tops), 1.34 (ray-traced rooms) times those stated
+# for scenes
 STRANGER = 1.25
 
 
