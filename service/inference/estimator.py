@@ -56,6 +56,11 @@ class Estimator:
     def manifest(self) -> Manifest:
         return self._pair.manifest
 
+    @property
+    def _strong_px(self) -> float:
+        """Blur that a copy of half the size shows better, in pixels of the larger one."""
+        return STRONG_BLUR * self.manifest.ranges.blur_px.high
+
     def warm_up(self) -> None:
         """Answer one small grey picture, so that the first request does not pay for preparing the graphs."""
         grey = np.full((WARM_UP_PX, WARM_UP_PX, 3), 128, np.uint8)
@@ -105,7 +110,7 @@ class Estimator:
             )
             told = self._read(rgb, coarser, side, cancellation, stopwatch)
             with stopwatch.stage("correct"):
-                blend(maps, told, ratio, STRONG_BLUR * most_blur_px)
+                blend(maps, told, ratio, self._strong_px)
             scales.append(coarser.image_width_px / width)
             most_blur_px /= COARSER
         reading = Reading.of(maps, working, (height, width), self.manifest, side, most_blur_px)
@@ -142,7 +147,7 @@ class Estimator:
         ranges = self.manifest.ranges
         if camera.k_cam_px * COARSER < ranges.k_cam_px.low:
             return False
-        return float((maps["blur_px"] > STRONG_BLUR * ranges.blur_px.high).mean()) > STRONG_FRACTION
+        return float((maps["blur_px"] > self._strong_px).mean()) > STRONG_FRACTION
 
     def _read(
         self, rgb: NDArray[np.uint8], working: Camera, side: Side, cancellation: Cancellation, stopwatch: Stopwatch
