@@ -1,6 +1,6 @@
 """A photograph and its camera to depth: chooses the scale, reads, decides. No answer depends on another."""
 
-import threading
+import weakref
 from typing import Self
 
 import numpy as np
@@ -10,6 +10,7 @@ from service.inference.artifact import Interval, Manifest, ModelFolder
 from service.inference.cancellation import Cancellation
 from service.inference.copies import blend
 from service.inference.depth_map import DepthMap, Reading, all_layers, decide
+from service.inference.later import Later
 from service.inference.pair import GraphPair, RawMaps, Side, Stopwatch
 from service.inference.part import Part
 from service.inference.resampling import Ratio
@@ -44,8 +45,8 @@ class Estimator:
     def __init__(self, pair: GraphPair, pixel_budget: int = PIXEL_BUDGET, kept_s: float = KEPT_S) -> None:
         self._pair = pair
         self._pixel_budget = pixel_budget
-        self._kept_s = kept_s
-        self._freeing = threading.Timer(0, pair.free_memory)
+        self._freeing = Later(pair.free_memory, kept_s)
+        self._stop_freeing = weakref.finalize(self, self._freeing.stop)
 
     @classmethod
     def from_folder(cls, folder: ModelFolder, *, intra_op_threads: int = 1) -> Self:
@@ -68,8 +69,8 @@ class Estimator:
         self.estimate(grey, Camera(WARM_UP_PX, WARM_UP_PX, middle, self.manifest.ranges.k_cam_px.high))
 
     def close(self) -> None:
-        """Nothing happens later any more."""
-        self._freeing.cancel()
+        """Nothing happens later any more: so too when the process ends."""
+        self._stop_freeing()
 
     def estimate(
         self,
@@ -115,7 +116,7 @@ class Estimator:
             most_blur_px /= COARSER
         reading = Reading.of(maps, working, (height, width), self.manifest, side, most_blur_px)
         if height * width > SMALL_PX:
-            self._free_memory_later()
+            self._freeing.ask()  # what a large picture has taken is kept for the next one, but for a while only
         cancellation.check()
         with stopwatch.stage("encode"):
             depth_m, valid = decide(reading, (height, width))
@@ -128,13 +129,6 @@ class Estimator:
             warnings=(*self._warnings(reading, most_blur_px), *_sparseness(valid)),
             timings_ms=stopwatch.elapsed_ms,
         )
-
-    def _free_memory_later(self) -> None:
-        """What a large picture has taken is kept for the next one, but for a while only."""
-        self._freeing.cancel()
-        self._freeing = threading.Timer(self._kept_s, self._pair.free_memory)
-        self._freeing.daemon = True
-        self._freeing.start()
 
     def _base_scale(self, camera: Camera) -> float:
         """The largest copy whose k_cam the model reads well, or a smaller one of a large picture; never enlarged."""
