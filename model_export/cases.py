@@ -177,7 +177,7 @@ def _near_steps(depth_m: Map) -> NDArray[np.bool_]:
 
 def procedural_cases(count: int, side: int, first: int = 0) -> Iterator[Case]:
     """Procedural scenes of seeds and textures that no training drew: all nearer (-1), farther (1), or both (0)."""
-    drawn = (draw_sample(HELD_OUT_SEED + number, SceneConfig(), []) for number in itertools.count(first))
+    drawn = (draw_sample(HELD_OUT_SEED + number, SceneConfig()) for number in itertools.count(first))
     for sample in itertools.islice((s for s in drawn if s.shot.side == side), count):
         shot = sample.shot
         height, width = sample.excess.shape

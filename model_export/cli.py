@@ -23,6 +23,9 @@ commands.add_typer(bench, name="bench")
 Kind = Annotated[str, typer.Option(help="compact (ours) or paper")]
 Model = Annotated[Path, typer.Option(help="model folder", file_okay=False)]
 Textures = Annotated[Path, typer.Option(help="folder of pictures with LICENCES.md", exists=True, file_okay=False)]
+Frames = Annotated[
+    Path | None, typer.Option(help="sharp pictures with depth, of camind homes: half of the scenes", exists=True)
+]
 Checkpoint = Annotated[Path, typer.Option(help="checkpoint file of a run", exists=True, dir_okay=False)]
 
 BLENDER_ENVIRONMENT = Path(".venv-blender")
@@ -57,6 +60,7 @@ def _training_parts() -> Iterator[None]:
 def train(
     run: Annotated[Path, typer.Option(help="folder of the run: its checkpoint lies there and is gone on from")],
     textures: Textures,
+    frames: Frames = None,
     kind: Kind = "compact",
     steps: Annotated[int, typer.Option(min=1, help="batches in the whole run")] = 12_000,
     seed: Annotated[int, typer.Option(min=0, help="the same seed is the same run")] = 1,
@@ -81,7 +85,9 @@ def train(
         kind="paper" if kind == "paper" else "compact", seed=seed, steps=steps, learning_rate=learning_rate
     )
     try:
-        path = run_training(config, textures, run, weights=weights, teacher=teacher, workers=workers, device=device)
+        path = run_training(
+            config, textures, run, frames=frames, weights=weights, teacher=teacher, workers=workers, device=device
+        )
     except (FileNotFoundError, ValueError) as exc:
         raise _fail(str(exc)) from exc
     typer.echo(path)
@@ -138,6 +144,7 @@ def export(
     checkpoint: Checkpoint,
     textures: Textures,
     out: Annotated[Path, typer.Option(help="model folder to write")],
+    frames: Frames = None,
     name: Annotated[str | None, typer.Option(help="name of the model")] = None,
 ) -> None:
     """Write a checkpoint as a model folder, and in it one in int8: two ONNX graphs, card and manifest each."""
@@ -146,8 +153,9 @@ def export(
         from model_export.quantized import quantised_graphs
         from model_export.temperature import calibrate
 
-    manifest = export_checkpoint(checkpoint, textures, out, name)
-    export_checkpoint(checkpoint, textures, out / INT8, f"{manifest.name}-{INT8}", quantised_graphs)
+    pictures = [folder for folder in (textures, frames) if folder is not None]
+    manifest = export_checkpoint(checkpoint, pictures, out, name)
+    export_checkpoint(checkpoint, pictures, out / INT8, f"{manifest.name}-{INT8}", quantised_graphs)
     for folder in (out, out / INT8):
         calibrated = calibrate(folder)
         typer.echo(f"{calibrated.name} in {folder}, stated errors times {calibrated.temperature:.2f}")
@@ -295,3 +303,31 @@ def blender(
     Console().print(table)
     if worst > cycles.EDGE_TOLERANCE:
         raise _fail(f"ours and Cycles differ by {worst:.1%}, more than {cycles.EDGE_TOLERANCE:.0%}")
+
+
+@commands.command()
+def homes(
+    out: Annotated[Path, typer.Option(help="folder of the frames, for train --frames", file_okay=False)],
+    furniture: Annotated[
+        Path, typer.Option(help="folder of *.sh3f libraries (Debian's sweethome3d-furniture)", exists=True)
+    ],
+    textures: Textures,
+    rooms: Annotated[int, typer.Option(min=1, max=100_000, help="rooms to render, eight views of each")] = 100,
+    environment: Annotated[Path, typer.Option(help="Blender's own environment, made if missing")] = BLENDER_ENVIRONMENT,
+) -> None:
+    """Ray-trace furnished rooms, sharp and with depth, to train on; stop and start it as you like."""
+    with _training_parts():
+        from model_export.datasets import homes as furnished
+        from model_export.datasets.blender import environment as blender_environment
+
+    try:
+        with progress_bar(Console(stderr=True)) as progress:
+            task = progress.add_task("Blender", total=None)
+            python = blender_environment(environment)
+            models = furnished.unpack(furniture, out / "models")
+            due = furnished.due(out, rooms)
+            progress.update(task, description="rendering", total=len(due) * furnished.VIEWS)
+            furnished.render(python, models, textures, due, out, lambda _: progress.advance(task))
+    except (FileNotFoundError, RuntimeError) as exc:
+        raise _fail(str(exc)) from exc
+    typer.echo(out)

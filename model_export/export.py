@@ -3,7 +3,7 @@
 import logging
 import subprocess
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -222,13 +222,13 @@ def export_pair(
 
 def export_checkpoint(
     checkpoint: Path,
-    textures: Path,
+    pictures: Iterable[Path],
     folder: Path,
     name: str | None = None,
     write_graphs: Callable[[Pair, Path], Graphs] = export_graphs,
 ) -> Manifest:
-    """Write the model folder of a checkpoint file; the card carries the licences that lie by the textures."""
+    """Write the model folder of a checkpoint file; the card carries the licences of the folders it was trained with."""
     loaded = Checkpoint.load(checkpoint)
-    licences = textures / LICENCES
-    sources = licences.read_text() if licences.exists() else ""
+    licences = (trained_with / LICENCES for trained_with in pictures)
+    sources = "".join(file.read_text() for file in licences if file.exists())
     return export_pair(loaded.pair(), loaded.config, loaded.step, folder, name, sources, write_graphs)

@@ -23,6 +23,7 @@ from model_export.losses import Batch, run_pair
 from model_export.networks import Normed, Pair, Widths, batch_norm, make_pair, norm_gain
 from model_export.progress import progress_bar
 from model_export.restored import restored, spread_norms
+from model_export.scenes import Material
 from model_export.textures import load_photographs
 from model_export.train import Checkpoint, Pool, held_out
 
@@ -169,9 +170,9 @@ def narrow(
     Of ``config`` the scenes count, and the pool they are drawn from. Raises ``ValueError`` for a folder of another
     kind, or widths that are not fewer.
     """
-    wide, photographs = restored(model), load_photographs(textures)
+    wide, material = restored(model), Material(load_photographs(textures))
     require_fewer(wide, widths)
-    pool = Pool(config, photographs, 0, workers=1)
+    pool = Pool(config, material, 0, workers=1)
     with progress_bar(console or Console(stderr=True)) as progress:
         for _ in progress.track(pool.fill(), total=config.pool, description="scenes"):
             pass
@@ -179,7 +180,7 @@ def narrow(
         spread_norms(wide, (partial(run_pair, wide, batch) for batch in batches))
         pair = narrowed(wide, widths, progress.track(batches, description="channels"))
     Checkpoint(config, 0, pair.modules().state_dict(), []).save(out)
-    test = held_out(config.scenes, photographs, 2 * config.batch)
+    test = held_out(config.scenes, material, 2 * config.batch)
     with torch.inference_mode():
         (blur, depth), (narrow_blur, narrow_depth) = (run_pair(either, test) for either in (wide, pair))
     changed_blur = (torch.log(narrow_blur.blur_px) - torch.log(blur.blur_px)).abs().mean()

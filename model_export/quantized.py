@@ -89,7 +89,7 @@ def quantised_graphs(pair: Pair, folder: Path) -> Graphs:
 def _scene_feeds(pair: Pair, feature_names: tuple[str, ...]) -> Iterator[tuple[Feeds, Feeds]]:
     """What the blur graph and the depth graph are given for generated scenes."""
     for number in range(SCENES):
-        sample = draw_sample(FIRST_SEED + number, SceneConfig(), [])
+        sample = draw_sample(FIRST_SEED + number, SceneConfig())
         image = sample.image[None].astype(np.float32) / np.float32(255)
         camera = {name: getattr(sample.shot, name) for name in CAMERA}
         yield {"image": image}, through_torch(pair, image, camera, feature_names)[1]

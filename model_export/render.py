@@ -23,6 +23,7 @@ from service.optics.light import decode_srgb, encode_srgb
 
 LEVEL_RATIO = 1.25
 LEVEL_OFFSET_PX = 0.5
+SLICES_PER_LEVEL = 0.5  # of a picture whose blur varies within each
 MARGIN_SIGMAS = 3.0
 SOFT_EDGE_VARIANCE = 0.25
 SAMPLED_BELOW_VARIANCE = 0.8
@@ -186,9 +187,9 @@ def render_layers(layers: list[Layer], spread: PointSpread) -> tuple[Tensor, Ten
     return composite(parts), (clear * alpha).argmax(0)
 
 
-def _slices(defocus_px: NDArray[np.float32]) -> NDArray[np.int32]:
-    """Number the slices of a signed defocus map [h,w], nearest (most negative) 0, steps as ``blur_levels``."""
-    scaled = np.sign(defocus_px) * np.log1p(np.abs(defocus_px) / LEVEL_OFFSET_PX) / math.log(LEVEL_RATIO) * 2
+def _slices(defocus_px: NDArray[np.float32], per_level: float = 2.0) -> NDArray[np.int32]:
+    """Number the slices of a signed defocus map [h,w], nearest 0, so many to a step of ``blur_levels``."""
+    scaled = np.sign(defocus_px) * np.log1p(np.abs(defocus_px) / LEVEL_OFFSET_PX) / math.log(LEVEL_RATIO) * per_level
     index = np.round(scaled).astype(np.int32)
     return np.unique(index, return_inverse=True)[1].reshape(index.shape).astype(np.int32)
 
@@ -202,6 +203,27 @@ def _filled(image: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np.
     colors[labels[known]] = image[known]
     filled: NDArray[np.float32] = colors[labels]
     return filled
+
+
+def _slice(linear: NDArray[np.float32], index: NDArray[np.int32], number: int) -> tuple[Tensor, Tensor]:
+    """Premultiplied colour [3,h,w] and alpha [1,h,w] of one slice of a picture [h,w,3], nearer ones taken away."""
+    shown = torch.from_numpy((index <= number).astype(np.float32))[None]
+    color = torch.from_numpy(_filled(linear, index >= number)).permute(2, 0, 1).float()
+    return color * shown, shown
+
+
+def sliced(linear: NDArray[np.float32], defocus_px: NDArray[np.float32]) -> tuple[list[Layer], NDArray[np.int32]]:
+    """A sharp picture [h,w,3] in linear light with its signed defocus [h,w] as layers, and each pixel's layer [h,w].
+
+    Nearest first; each is continued behind what is nearer, with the nearest colour of its own or farther ones.
+    """
+    index = _slices(defocus_px, SLICES_PER_LEVEL)
+    layers = []
+    for number in range(int(index.max()) + 1):
+        own = defocus_px[index == number]
+        color, alpha = _slice(linear, index, number)
+        layers.append(Layer(color, alpha, torch.from_numpy(np.clip(defocus_px, own.min(), own.max()))))
+    return layers, index
 
 
 def refocus(
@@ -225,11 +247,8 @@ def refocus(
 
     def blurred() -> Iterable[tuple[Tensor, Tensor]]:
         for number in range(int(index.max()) + 1):
-            shown = index <= number
-            color = _filled(linear, index >= number) * shown[..., None]
-            rgba = torch.from_numpy(np.concatenate([color, shown[..., None]], axis=2).astype(np.float32))
             level = float(sigma[index == number].mean())
-            out = blur(rgba.permute(2, 0, 1), level, spread)
+            out = blur(torch.cat(_slice(linear, index, number)), level, spread)
             yield out[:3], out[3:]
 
     rest = math.sqrt(max(camera.gamma_px**2 - thin_lens.PIXEL_BOX_VARIANCE, 0.0))

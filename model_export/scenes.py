@@ -5,7 +5,7 @@ sigma = k_cam |q - 1|; q > 1 is nearer than focus, q < 1 beyond.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from statistics import NormalDist
 
 import cv2
@@ -14,7 +14,8 @@ import torch
 from numpy.typing import NDArray
 
 from model_export.config import SceneConfig
-from model_export.render import Layer, PointSpread, blur, render_layers
+from model_export.frames import Frame, draw_view
+from model_export.render import Layer, PointSpread, blur, render_layers, sliced
 from model_export.rooms import Surface, draw_room
 from model_export.textures import draw_texture
 from service.optics import thin_lens
@@ -43,10 +44,20 @@ MOSAIC_SHARE = 0.4
 MOSAIC_VARIANCE = 0.35  # what a bilinear demosaic adds to luminance, px^2
 SHOT_NOISE, READ_NOISE = (1e-6, 2e-3), (1e-4, 4e-3)
 GRAINY_SHARE, GRAIN = 0.25, (3e-4, 3e-3)  # dim light: grain must not pass for sharpness
+FRAME_SHARE = 0.5  # of scenes, where there are frames
+MOSTLY = 0.98
 PLAIN_SHARE = 0.35  # not compressed: the network must not need the noise of JPEG
 RESCALED_SHARE = 0.15
 RESCALES = (1.2, 1.6)
 Map = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Material:
+    """What scenes are made of: photographs uint8 [h,w,3] to lay on surfaces, and sharp frames with depth."""
+
+    photographs: list[NDArray[np.uint8]] = field(default_factory=list)
+    frames: list[Frame] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +83,9 @@ class Sample:
     image: NDArray[np.uint8]
     excess: NDArray[np.float16]
     shot: Shot
+
+
+NOTHING = Material()
 
 
 def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float], lean: float = 1.0) -> float:
@@ -270,12 +284,37 @@ def develop(rng: np.random.Generator, linear: Map, config: SceneConfig, *, throu
     return np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)[:, :, ::-1]
 
 
-def draw_sample(seed: int, config: SceneConfig, photographs: list[NDArray[np.uint8]]) -> Sample:
-    """The scene of this seed: the same seed, config and photographs give the same sample."""
+def _frame_layers(
+    rng: np.random.Generator, shot: Shot, config: SceneConfig, frame: Frame
+) -> tuple[Shot, list[Layer], Map]:
+    """A frame before the shot's lens, which is focused so that one of its pixels is as far out of focus as may be.
+
+    Distances stay as they are. Where the blur would be more than the config allows, so is the shot's k_cam.
+    """
+    size = config.size_px + 2 * config.margin_px
+    light, depth_m, focal_length_px = draw_view(rng, frame, size)
+    anchor_m = float(depth_m[tuple(rng.integers(config.margin_px, size - config.margin_px, 2))])
+    focus_m = float(np.clip(anchor_m * (1 + _draw_excess(rng, shot, config)), *config.focus_distance_m))
+    excess = np.float32(focus_m) / depth_m - 1
+    most = float(np.quantile(np.abs(excess), MOSTLY))
+    k_cam_px = max(config.k_cam_px[0], min(shot.k_cam_px, config.defocus_px[1] / max(most, 1e-6)))
+    layers, index = sliced(light, -excess * np.float32(k_cam_px))
+    shot = replace(shot, k_cam_px=k_cam_px, focus_distance_m=focus_m, focal_length_px=focal_length_px, side=0)
+    found = [np.where(index == n, excess, excess[index == n].mean()) for n in range(len(layers))]
+    return shot, layers, np.stack(found).astype(np.float32)
+
+
+def draw_sample(seed: int, config: SceneConfig, material: Material = NOTHING) -> Sample:
+    """The scene of this seed: the same seed, config and material give the same sample."""
     rng = np.random.default_rng(seed)
     shot = draw_shot(rng, config)
+    if material.frames and rng.random() < FRAME_SHARE:
+        shot, layers, excesses = _frame_layers(
+            rng, shot, config, material.frames[int(rng.integers(len(material.frames)))]
+        )
+        return Sample(*_photograph(rng, shot, config, layers, excesses), shot)
     if rng.random() >= RESCALED_SHARE:
-        return Sample(*_photograph(rng, shot, config, photographs), shot)
+        return Sample(*_photograph(rng, shot, config, *draw_layers(rng, shot, config, material.photographs)), shot)
     size = config.size_px
     larger_px = round(size * rng.uniform(*RESCALES))
     ratio = larger_px / size
@@ -292,7 +331,7 @@ def draw_sample(seed: int, config: SceneConfig, photographs: list[NDArray[np.uin
         gamma_px=thin_lens.gamma_after_averaging(shot.gamma_px, ratio),
         focal_length_px=shot.focal_length_px * ratio,
     )
-    image, excess = _photograph(rng, taken, larger, photographs)
+    image, excess = _photograph(rng, taken, larger, *draw_layers(rng, taken, larger, material.photographs))
     small = cv2.resize(image.transpose(1, 2, 0), (size, size), interpolation=cv2.INTER_AREA)
     told = cv2.resize(excess.astype(np.float32), (size, size), interpolation=cv2.INTER_NEAREST)
     pixels = np.ascontiguousarray(np.asarray(small, np.uint8).transpose(2, 0, 1))
@@ -300,10 +339,9 @@ def draw_sample(seed: int, config: SceneConfig, photographs: list[NDArray[np.uin
 
 
 def _photograph(
-    rng: np.random.Generator, shot: Shot, config: SceneConfig, photographs: list[NDArray[np.uint8]]
+    rng: np.random.Generator, shot: Shot, config: SceneConfig, layers: list[Layer], excesses: Map
 ) -> tuple[NDArray[np.uint8], NDArray[np.float16]]:
-    """Picture uint8 [3,h,w] and q - 1 [h,w] of a random scene taken so."""
-    layers, excesses = draw_layers(rng, shot, config, photographs)
+    """Picture uint8 [3,h,w] and q - 1 [h,w] of surfaces, nearest first, taken so."""
     linear, front = render_layers(layers, shot.spread)
     seen = np.take_along_axis(excesses, front.numpy()[None], 0)[0]
     variance = shot.gamma_px**2 - thin_lens.PIXEL_BOX_VARIANCE

@@ -33,10 +33,14 @@ LETTERS = "ABCDEFGHJKLMNPRSTUVXYZabcdefghkmnoprstuvxyz0123456789&%#?"
 Image = NDArray[np.float32]
 
 
+def picture_files(folder: Path) -> list[Path]:
+    """All JPEG and PNG files below ``folder``, in a fixed order."""
+    return sorted(p for p in folder.rglob("*") if p.suffix.lower() in {".jpg", ".jpeg", ".png"})
+
+
 def load_photographs(folder: Path) -> list[NDArray[np.uint8]]:
     """All JPEG and PNG files below ``folder``, RGB, in a fixed order. Raises if there is none."""
-    files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in {".jpg", ".jpeg", ".png"})
-    images = [cv2.imread(str(path), cv2.IMREAD_COLOR) for path in files]
+    images = [cv2.imread(str(path), cv2.IMREAD_COLOR) for path in picture_files(folder)]
     photographs = [np.ascontiguousarray(image[:, :, ::-1], np.uint8) for image in images if image is not None]
     if not photographs:
         raise FileNotFoundError(f"no JPEG or PNG pictures below {folder}")

@@ -18,7 +18,6 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from rich.console import Console
 from torch.nn.utils import convert_conv2d_weight_memory_format
 from torch.utils.data import DataLoader, Dataset
@@ -26,12 +25,13 @@ from torch.utils.data import DataLoader, Dataset
 from model_export.config import Kind, SceneConfig, TrainConfig
 from model_export.cores import torch_threads
 from model_export.folded import folded
+from model_export.frames import load_frames
 from model_export.losses import Batch, run_pair, total_loss
 from model_export.networks import SHIPPED_WIDTHS, Pair, Widths, make_pair
 from model_export.optimizers import Optimizers
 from model_export.progress import progress_bar
 from model_export.restored import restored, spread_norms
-from model_export.scenes import Sample, draw_sample
+from model_export.scenes import Material, Sample, draw_sample
 from model_export.textures import load_photographs
 from service.cores import available_cores
 
@@ -46,8 +46,8 @@ HELD_OUT_SEED = 2**40
 class SceneStream(Dataset[Sample]):
     """Scene number ``start + i`` of a run, drawn in a worker process."""
 
-    def __init__(self, config: TrainConfig, photographs: list[NDArray[np.uint8]], start: int, end: int) -> None:
-        self.config, self.photographs = config, photographs
+    def __init__(self, config: TrainConfig, material: Material, start: int, end: int) -> None:
+        self.config, self.material = config, material
         self.start, self.end = start, end
 
     def __len__(self) -> int:
@@ -55,7 +55,7 @@ class SceneStream(Dataset[Sample]):
 
     def __getitem__(self, index: int) -> Sample:
         seed = self.config.seed * 2**32 + self.start + index
-        return draw_sample(seed, self.config.scenes, self.photographs)
+        return draw_sample(seed, self.config.scenes, self.material)
 
 
 def _worker_start(_: int) -> None:
@@ -64,11 +64,9 @@ def _worker_start(_: int) -> None:
     os.nice(5)
 
 
-def scene_stream(
-    config: TrainConfig, photographs: list[NDArray[np.uint8]], start: int, end: int, workers: int
-) -> Iterator[Sample]:
+def scene_stream(config: TrainConfig, material: Material, start: int, end: int, workers: int) -> Iterator[Sample]:
     """Scenes ``start`` to ``end`` in order, drawn ahead by worker processes (0: in this one)."""
-    stream = SceneStream(config, photographs, start, end)
+    stream = SceneStream(config, material, start, end)
     loader: DataLoader[Sample] = DataLoader(
         stream,
         batch_size=None,
@@ -83,10 +81,10 @@ def scene_stream(
 class Pool:
     """The last ``pool`` scenes of the stream; ``fresh_per_step`` new ones come in after every batch, on average."""
 
-    def __init__(self, config: TrainConfig, photographs: list[NDArray[np.uint8]], step: int, workers: int) -> None:
+    def __init__(self, config: TrainConfig, material: Material, step: int, workers: int) -> None:
         self.config = config
         first = self._drawn(step) - config.pool
-        self.stream = scene_stream(config, photographs, first, self._drawn(config.steps) + 1, workers)
+        self.stream = scene_stream(config, material, first, self._drawn(config.steps) + 1, workers)
         self.samples: deque[Sample] = deque(maxlen=config.pool)
 
     def _drawn(self, step: int) -> int:
@@ -136,9 +134,9 @@ def collate(samples: list[Sample], rng: np.random.Generator) -> Batch:
     return Batch(image.contiguous(memory_format=torch.channels_last), excess, *columns)
 
 
-def held_out(scenes: SceneConfig, photographs: list[NDArray[np.uint8]], count: int) -> Batch:
+def held_out(scenes: SceneConfig, material: Material, count: int) -> Batch:
     """Scenes of seeds no training draws, as one batch."""
-    samples = [draw_sample(HELD_OUT_SEED + i, scenes, photographs) for i in range(count)]
+    samples = [draw_sample(HELD_OUT_SEED + i, scenes, material) for i in range(count)]
     return collate(samples, np.random.default_rng(HELD_OUT_SEED))
 
 
@@ -326,6 +324,7 @@ def train(
     textures: Path,
     run: Path,
     *,
+    frames: Path | None = None,
     weights: Path | None = None,
     teacher: Path | None = None,
     workers: int = 1,
@@ -340,13 +339,13 @@ def train(
     Raises ``ValueError`` for weights of another kind, and for a run with a teacher that is gone on with without one.
     """
     console = console or Console(stderr=True)
-    photographs = load_photographs(textures)
+    material = Material(load_photographs(textures), [] if frames is None else load_frames(frames))
     run.mkdir(parents=True, exist_ok=True)
     path = run / "checkpoint.pt"
     trainer, start = _opened(config, path, weights, teacher, device)
     config = trainer.config
-    pool = Pool(config, photographs, trainer.step, workers)
-    test = held_out(config.scenes, photographs, 2 * config.batch)
+    pool = Pool(config, material, trainer.step, workers)
+    test = held_out(config.scenes, material, 2 * config.batch)
     # two busy processes on one core cost each far more than half its speed
     threads = max(1, available_cores() - workers)
     with torch_threads(threads), progress_bar(console) as progress:

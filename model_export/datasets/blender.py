@@ -11,6 +11,7 @@ import random
 import shutil
 import subprocess
 import tempfile
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -108,19 +109,27 @@ def render(python: Path, scenes: list[Scene], out: Path, on_progress: Callable[[
 
     Raises ``RuntimeError`` with the worker's last words if it fails.
     """
+    run_worker(python, WORKER, [asdict(scene) for scene in scenes], out, on_progress)
+
+
+def run_worker(python: Path, worker: Path, spec: object, out: Path, on_progress: Callable[[str], None]) -> None:
+    """Have Blender's Python run a script on a specification in JSON and a folder; each file's name as it is done.
+
+    Raises ``RuntimeError`` with the script's last words if it fails.
+    """
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as scratch:
-        specs = Path(scratch) / "scenes.json"
-        specs.write_text(json.dumps([asdict(scene) for scene in scenes]))
-        command = [str(python), str(WORKER), str(specs), str(out)]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as worker:
-            said: list[str] = []
-            for line in worker.stdout or ():
+        told = Path(scratch) / "spec.json"
+        told.write_text(json.dumps(spec))
+        command = [str(python), str(worker), str(told), str(out)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as running:
+            said: deque[str] = deque(maxlen=10)
+            for line in running.stdout or ():
                 said.append(line)
                 if line.startswith("rendered "):
                     on_progress(line.split()[1])
-        if worker.returncode:
-            raise RuntimeError(f"Blender failed: {''.join(said[-10:])}")
+        if running.returncode:
+            raise RuntimeError(f"Blender failed: {''.join(said)}")
 
 
 def sharp_edge(size_px: int) -> Map:

@@ -97,8 +97,10 @@ def depth_of(scene):
     layer = scene.view_layers[0]
     layer.material_override = made
     background, scene.world = scene.world, sky((0, 0, 0))
-    scene.cycles.filter_width = 0.01
+    filter_width, denoised = scene.cycles.filter_width, scene.cycles.use_denoising
+    scene.cycles.filter_width, scene.cycles.use_denoising = 0.01, False
     found = shot(scene, 1, False)[..., 0]
+    scene.cycles.filter_width, scene.cycles.use_denoising = filter_width, denoised
     layer.material_override, scene.world = None, background
     return found
 
@@ -219,4 +221,5 @@ def main():
         sys.stdout.flush()
 
 
-main()
+if __name__ == "__main__":
+    main()

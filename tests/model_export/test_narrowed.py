@@ -13,6 +13,7 @@ from model_export.config import SceneConfig, TrainConfig
 from model_export.losses import Batch, run_pair
 from model_export.narrowed import narrow, narrowed
 from model_export.networks import Pair, Widths, make_pair
+from model_export.scenes import Material
 from model_export.train import Checkpoint, held_out, starting_pair
 
 SHIPPED = Path(__file__).parents[2] / "service" / "models"
@@ -22,7 +23,7 @@ NARROW = Widths((16, 16, 16, 32), (16, 16, 16, 32))
 
 @pytest.fixture(scope="module")
 def batch() -> Batch:
-    return held_out(SceneConfig(size_px=64, margin_px=16), [], 4)
+    return held_out(SceneConfig(size_px=64, margin_px=16), Material(), 4)
 
 
 def blur_and_depth(pair: Pair, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:

@@ -11,6 +11,7 @@ from model_export.config import SceneConfig
 from model_export.losses import Batch, run_pair
 from model_export.networks import Pair
 from model_export.restored import restored, spread_norms
+from model_export.scenes import Material
 from model_export.train import held_out
 from service.inference.artifact import load_model_folder
 
@@ -19,7 +20,7 @@ SHIPPED = Path(__file__).parents[2] / "service" / "models"
 
 @pytest.fixture(scope="module")
 def batch() -> Batch:
-    return held_out(SceneConfig(size_px=64, margin_px=16), [], 4)
+    return held_out(SceneConfig(size_px=64, margin_px=16), Material(), 4)
 
 
 def differences(pair: Pair, batch: Batch) -> list[float]:

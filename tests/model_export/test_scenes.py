@@ -12,7 +12,7 @@ SEEDS = range(30)
 
 
 def test_a_seed_is_a_scene() -> None:
-    first, again, other = draw_sample(5, CONFIG, []), draw_sample(5, CONFIG, []), draw_sample(6, CONFIG, [])
+    first, again, other = draw_sample(5, CONFIG), draw_sample(5, CONFIG), draw_sample(6, CONFIG)
     assert first.shot == again.shot
     np.testing.assert_array_equal(first.image, again.image)
     np.testing.assert_array_equal(first.excess, again.excess)
@@ -21,7 +21,7 @@ def test_a_seed_is_a_scene() -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_scene_keeps_to_its_ranges(seed: int) -> None:
-    sample = draw_sample(seed, CONFIG, [])
+    sample = draw_sample(seed, CONFIG)
     shot, excess = sample.shot, sample.excess.astype(np.float32)
     assert sample.image.shape == (3, 64, 64)
     assert CONFIG.k_cam_px[0] <= shot.k_cam_px <= CONFIG.k_cam_px[1]
@@ -37,7 +37,7 @@ def test_a_scene_keeps_to_its_ranges(seed: int) -> None:
 
 
 def test_all_sides_and_lens_shapes_turn_up() -> None:
-    shots = [draw_sample(seed, SceneConfig(size_px=32, margin_px=8), []).shot for seed in range(60)]
+    shots = [draw_sample(seed, SceneConfig(size_px=32, margin_px=8)).shot for seed in range(60)]
     assert {shot.side for shot in shots} == {-1, 0, 1}
     assert {0.0, 1.0} < {shot.spread.disc_share for shot in shots}
 
@@ -47,7 +47,7 @@ def test_some_scenes_are_nothing_but_a_level_wall(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(scenes, "LEVEL_SHARE", 1.0)
     monkeypatch.setattr(scenes, "RESCALED_SHARE", 0.0)
     for seed in range(4):
-        assert np.ptp(draw_sample(seed, CONFIG, []).excess) == 0
+        assert np.ptp(draw_sample(seed, CONFIG).excess) == 0
 
 
 def test_most_lenses_blur_red_and_blue_more_before_the_focus_than_beyond() -> None:
@@ -73,6 +73,6 @@ def test_beyond_a_close_focus_lies_what_is_seen_and_before_a_distant_one(
 @pytest.mark.parametrize(("focus_m", "beyond"), [(0.3, (0.65, 0.95)), (2.0, (0.3, 0.7)), (5.0, (0.05, 0.35))])
 def test_where_both_sides_are_seen_the_focus_says_how_much_of_each(focus_m: float, beyond: tuple[float, float]) -> None:
     config = SceneConfig(size_px=32, margin_px=8, focus_distance_m=(focus_m, focus_m))
-    samples = [sample for sample in (draw_sample(seed, config, []) for seed in range(80)) if sample.shot.side == 0]
+    samples = [sample for sample in (draw_sample(seed, config) for seed in range(80)) if sample.shot.side == 0]
     low, high = beyond
     assert low < np.mean([(sample.excess < 0).mean() for sample in samples]) < high

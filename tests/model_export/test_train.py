@@ -19,7 +19,7 @@ from model_export.folded import folded
 from model_export.losses import run_pair, total_loss
 from model_export.networks import Widths, make_pair
 from model_export.restored import restored, spread_norms
-from model_export.scenes import draw_sample
+from model_export.scenes import Material, draw_sample
 from model_export.textures import load_photographs
 from model_export.train import (
     Checkpoint,
@@ -96,7 +96,7 @@ def test_a_new_run_begins_with_the_weights_it_is_told(textures: Path, tmp_path: 
 
 
 def test_a_new_run_goes_on_from_a_model_folder() -> None:
-    batch = collate([draw_sample(seed, SCENES, []) for seed in range(2)], np.random.default_rng(0))
+    batch = collate([draw_sample(seed, SCENES) for seed in range(2)], np.random.default_rng(0))
     start = starting_pair(SHIPPED, "compact")
     trainer = Trainer(CONFIG, "cpu", widths=Widths.of(start.modules().state_dict()))
     spread_norms(start, [partial(run_pair, start, batch)])
@@ -129,7 +129,7 @@ def test_a_stopped_run_goes_on_as_if_it_had_not_been_stopped(textures: Path, tmp
     whole, _ = run(CONFIG, textures, tmp_path / "whole")
     (tmp_path / "stopped").mkdir()
     halfway = Trainer(CONFIG, "cpu")
-    pool = Pool(CONFIG, load_photographs(textures), 0, 0)
+    pool = Pool(CONFIG, Material(load_photographs(textures)), 0, 0)
     list(pool.fill())
     with torch_threads(available_cores()):  # as without workers: other threads round otherwise
         for step in range(3):
@@ -142,7 +142,7 @@ def test_a_stopped_run_goes_on_as_if_it_had_not_been_stopped(textures: Path, tmp
 
 
 def test_statistics_follow_the_batches_until_they_are_settled() -> None:
-    batch = collate([draw_sample(seed, SCENES, []) for seed in range(2)], np.random.default_rng(0))
+    batch = collate([draw_sample(seed, SCENES) for seed in range(2)], np.random.default_rng(0))
     trainer = Trainer(CONFIG, "cpu")
 
     def moved() -> bool:
@@ -156,7 +156,7 @@ def test_statistics_follow_the_batches_until_they_are_settled() -> None:
 
 def test_what_lies_on_the_side_that_nobody_asked_for_moves_no_depth() -> None:
     pair = make_pair("compact")
-    samples = (draw_sample(seed, SCENES, []) for seed in count())
+    samples = (draw_sample(seed, SCENES) for seed in count())
     both = next(s for s in samples if s.shot.side == 0 and s.excess.min() < 0 < s.excess.max())
     batch = collate([both], np.random.default_rng(0))
     config = replace(CONFIG, b_weight=0.0)
@@ -173,7 +173,7 @@ def test_what_lies_on_the_side_that_nobody_asked_for_moves_no_depth() -> None:
 
 def test_a_few_steps_on_one_batch_lower_the_loss() -> None:
     config = replace(CONFIG, steps=1000)
-    samples = [draw_sample(seed, SCENES, []) for seed in range(4)]
+    samples = [draw_sample(seed, SCENES) for seed in range(4)]
     batch = collate(samples, np.random.default_rng(0))
     trainer = Trainer(config, "cpu")
     losses = [trainer.advance(batch)["loss"] for _ in range(25)]
@@ -181,7 +181,7 @@ def test_a_few_steps_on_one_batch_lower_the_loss() -> None:
 
 
 def test_who_has_a_teacher_comes_to_answer_alike() -> None:
-    batch = collate([draw_sample(seed, SCENES, []) for seed in range(4)], np.random.default_rng(0))
+    batch = collate([draw_sample(seed, SCENES) for seed in range(4)], np.random.default_rng(0))
     torch.manual_seed(5)
     teacher = make_pair("compact")
     teacher.modules().eval()

@@ -1,0 +1,56 @@
+"""Sharp pictures with depth (``camind homes``), to be photographed by cameras that training draws."""
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from model_export.datasets.photos import filled, load_photos
+from service.optics.light import decode_srgb
+
+SIZES = (0.65, 1.0)  # of the frame's own size
+CONTRASTS = (0.75, 1.3)  # power of the light
+TINTS = (0.8, 1.2)
+Map = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A sharp picture uint8 [h,w,3] (sRGB), its depth in metres as float16 [h,w], and its focal length in px."""
+
+    image: NDArray[np.uint8]
+    depth_m: NDArray[np.float16]
+    focal_length_px: float
+
+
+def load_frames(folder: Path) -> list[Frame]:
+    """All frames of a folder with ``color/``, ``depth/`` and ``cameras.json``. Raises if there is none."""
+    cameras = json.loads((folder / "cameras.json").read_text())
+    return [
+        Frame(photo.image, filled(photo.depth_m).astype(np.float16), cameras[photo.name]["fx_px"])
+        for photo in load_photos(folder)
+    ]
+
+
+def draw_view(rng: np.random.Generator, frame: Frame, size: int) -> tuple[Map, Map, float]:
+    """A part of the frame, mirrored where it ends: linear light [size,size,3], depth [size,size] m, focal length px."""
+    grow = math.exp(rng.uniform(math.log(SIZES[0]), math.log(SIZES[1])))
+    height, width = (round(grow * side) for side in frame.image.shape[:2])
+    image = cv2.resize(frame.image, (width, height), interpolation=cv2.INTER_AREA)
+    depth_m = cv2.resize(frame.depth_m.astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST)
+    rows, columns = (_window(rng, side, size) for side in (height, width))
+    light = decode_srgb(np.asarray(image, np.float32)[rows][:, columns] / np.float32(255))
+    light = (light ** rng.uniform(*CONTRASTS)) * rng.uniform(*TINTS, 3).astype(np.float32)
+    return light.astype(np.float32), np.asarray(depth_m, np.float32)[rows][:, columns], grow * frame.focal_length_px
+
+
+def _window(rng: np.random.Generator, side: int, size: int) -> NDArray[np.intp]:
+    """Which rows or columns a window of that size shows; past the borders it goes back."""
+    spare = side - size
+    first = int(rng.integers(0, spare + 1)) if spare > 0 else spare // 2
+    at = np.arange(first, first + size)
+    return np.asarray(np.minimum(np.abs(at), 2 * (side - 1) - at), np.intp) if spare < 0 else at
