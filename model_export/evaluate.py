@@ -43,6 +43,7 @@ EQUAL_BLUR_PX = ((1.0, 2.0), (2.0, 4.0), (4.0, 8.0), (8.0, 16.0))
 EQUAL_DEFOCUS = ((0.1, 0.25), (0.25, 0.5), (0.5, 1.0), (1.0, 2.0))
 EQUAL = ("equal_blur", "equal_defocus")
 LEAST_COMPARED = 300
+LEAST_RELIEF = 1e-3
 KEPT_SHARES = (1.0, 0.75, 0.5, 0.25, 0.1)
 CLEARLY_OUT = 0.25  # |x| from where on the side of focus is asked for
 SAMPLED_PIXELS = 3000
@@ -120,6 +121,30 @@ class Sides:
 
 
 @dataclass(frozen=True, slots=True)
+class Relief:
+    """What answers make of the depth differences within a picture, in ln z about its mean over the picture.
+
+    ``true`` is the differences' standard deviation, ``slope`` the part of them that is answered (1: all, 0: one depth
+    for everything), ``correlation`` that of the differences answered with the true ones.
+    """
+
+    true: float
+    slope: float
+    correlation: float
+
+    @staticmethod
+    def of(pictures: Sequence[Pixels]) -> "Relief | None":
+        """Over pixels of several pictures; None where nothing stands out from anything."""
+        logs = [(np.log(p.truth), np.log(p.answer)) for p in pictures]
+        truth, answer = (np.concatenate([a - a.mean() for a in several]) for several in zip(*logs, strict=True))
+        deviation = float(truth.std())
+        if deviation < LEAST_RELIEF:
+            return None
+        joint = float((truth * answer).mean())
+        return Relief(deviation, joint / deviation**2, joint / (deviation * max(float(answer.std()), LEAST_RELIEF)))
+
+
+@dataclass(frozen=True, slots=True)
 class Outcome:
     """What one picture scored, what the best constant depth would have, and the share of scored pixels answered.
 
@@ -146,7 +171,7 @@ class Summary:
     ``certain_abs_rel`` is that of the half of the pixels with the least stated error; ``order`` is the mean error
     of the most certain tenth over that of the least certain half; ``kept_abs_rel`` has the errors of the most certain
     shares ``KEPT_SHARES``, and ``within`` the shares of truths within one and two stated deviations. ``equal_blur`` and
-    ``equal_defocus`` are the AbsRel by range, None where few pixels are.
+    ``equal_defocus`` are the AbsRel by range, None where few pixels are; ``relief`` is None for pictures of one depth.
     """
 
     name: str
@@ -164,6 +189,7 @@ class Summary:
     equal_blur: dict[str, float | None]
     equal_defocus: dict[str, float | None]
     sides: Sides | None
+    relief: Relief | None
     depth: Pixels
 
     @property
@@ -174,9 +200,10 @@ class Summary:
         plain = ("name", "mode", "pictures", "answered", "median_error", "certain_abs_rel", "order", *EQUAL)
         tables = ("pooled", "mean", "constant_pooled", "constant_mean")
         shares = {"kept_abs_rel": dict(zip(KEPT_SHARES, self.kept_abs_rel, strict=True)), "within": self.within}
-        sides = {"sides": asdict(self.sides) if self.sides else None}
+        parts = {"sides": self.sides, "relief": self.relief}
+        told = {name: asdict(part) if part else None for name, part in parts.items()}
         scores = {n: getattr(self, n).as_dict() for n in tables}
-        return {n: getattr(self, n) for n in plain} | scores | shares | sides
+        return {n: getattr(self, n) for n in plain} | scores | shares | told
 
 
 @dataclass(frozen=True, slots=True)
@@ -335,6 +362,7 @@ def summarise(name: str, mode: str, outcomes: Sequence[Outcome]) -> Summary:
         equal_blur=_by_range(error, np.concatenate([o.depth_blur_px for o in outcomes]), EQUAL_BLUR_PX),
         equal_defocus=_by_range(error, np.concatenate([o.depth_defocus for o in outcomes]), EQUAL_DEFOCUS),
         sides=Sides.joined([o.sides for o in outcomes if o.sides is not None]),
+        relief=Relief.of([o.depth for o in outcomes]),
         depth=depth,
     )
 

@@ -4,6 +4,7 @@ import html
 import json
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 import cv2
@@ -42,6 +43,7 @@ EQUAL_HEAD = [
     *(f"lambda {low:g}-{high:g} px" for low, high in EQUAL_BLUR_PX),
     *(f"x {low:g}-{high:g}" for low, high in EQUAL_DEFOCUS),
 ]
+RELIEF_HEAD = ["set", "camera", "true spread of ln z", "of it answered", "correlation"]
 SCORES_HEAD = ["set", "camera", "over", "AbsRel", "MSE", "RMSE", "log10", "delta1", "delta2", "delta3"]
 BLUR_HEAD = ["scenes", "lambda px", "pixels", "median error", "certain half", "90th percentile", "bias", "order"]
 NOMINAL = np.linspace(0.05, 0.95, 19)
@@ -71,6 +73,10 @@ def _equal_row(s: Summary) -> list[str]:
     return [*_camera(s), *("" if v is None else f"{v:.3f}" for v in found)]
 
 
+def _relief_rows(s: Summary) -> list[list[str]]:
+    return [[*_camera(s), *(f"{v:.2f}" for v in asdict(s.relief).values())]] if s.relief else []
+
+
 def _score_rows(s: Summary) -> list[list[str]]:
     ways = {"pixels": s.pooled, "pictures": s.mean}
     return [[*_camera(s), way, *(f"{v:.3f}" for v in scores.as_dict().values())] for way, scores in ways.items()]
@@ -88,6 +94,7 @@ def tables(report: Report) -> dict[str, Table]:
         "Depth": (DEPTH_HEAD, [_depth_row(s) for s in report.sets]),
         "Certainty": (CERTAINTY_HEAD, [_certainty_row(s) for s in report.sets if s.mode == "gt"]),
         "AbsRel at equal blur and defocus": (EQUAL_HEAD, [_equal_row(s) for s in report.sets if s.mode == "gt"]),
+        "Depth differences within a picture": (RELIEF_HEAD, [row for s in report.sets for row in _relief_rows(s)]),
         "All scores of depth": (SCORES_HEAD, [row for s in report.sets for row in _score_rows(s)]),
         "Blur": (BLUR_HEAD, [_blur_row(b) for b in report.blur]),
     }

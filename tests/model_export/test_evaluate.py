@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from model_export.cases import REFERENCE, Case, d200_cases, procedural_cases, shuffled_cases, viewed_cases
 from model_export.cli import commands
-from model_export.evaluate import EQUAL_BLUR_PX, Examiner, Pixels, Sides, blur_ranges, summarise
+from model_export.evaluate import EQUAL_BLUR_PX, Examiner, Pixels, Relief, Sides, blur_ranges, summarise
 from model_export.temperature import STRANGER, calibrate, temperature
 from service.inference.artifact import load_model_folder
 from service.optics import thin_lens
@@ -91,6 +91,29 @@ def test_the_certain_half_is_that_of_the_least_stated_error() -> None:
     pixels = Pixels(np.ones(4, np.float32), np.array([1, 1.1, 3, 2], np.float32), stated)
     assert pixels.certain().tolist() == [True, True, False, False]
     assert pixels.error == pytest.approx([0, 0.1, 2, 1])
+
+
+def test_relief_is_what_of_the_differences_within_a_picture_is_answered() -> None:
+    """Not what pictures differ by: one is twice as far as the other, and answered so."""
+    truth = np.geomspace(0.5, 2, 101).astype(np.float32)
+    other = np.cos(np.linspace(0, 40 * np.pi, 101))
+    pictures = [Pixels(f * truth, f * truth**0.5, np.ones_like(truth)) for f in (1, 2)]
+    relief = Relief.of(pictures)
+    assert relief is not None
+    assert relief.true == pytest.approx(np.log(truth).std(), abs=1e-3)
+    assert relief.slope == pytest.approx(0.5, abs=1e-3)
+    assert relief.correlation == pytest.approx(1, abs=1e-3)
+    unrelated = Relief.of([Pixels(truth, np.exp(other).astype(np.float32), truth)])
+    assert unrelated is not None
+    assert abs(unrelated.correlation) < 0.05
+
+
+def test_a_single_depth_answered_has_no_relief_and_a_true_one_is_not_scored() -> None:
+    truth, level = np.array([1, 2], np.float32), np.ones(2, np.float32)
+    relief = Relief.of([Pixels(truth, level, level)])
+    assert relief is not None
+    assert (relief.slope, relief.correlation) == (0, 0)
+    assert Relief.of([Pixels(level, truth, level)]) is None
 
 
 def test_intervals_hold_what_lies_within_them() -> None:
@@ -218,6 +241,8 @@ def test_the_command_prints_and_writes_what_it_found(data: Path, tiny_model_dir:
     sets = {(s["name"], s["mode"]): s for s in report["sets"]}
     assert sets["indoor k_cam 3.81", "gt"]["pictures"] == 2
     assert sets["rgbd k_cam 3.81", "no k_cam"]["pooled"]["rmse"] > 0
+    assert sets["procedural mixed", "gt"]["relief"]["true"] > 0
+    assert sets["plane 1 m", "gt"]["relief"] is None
     page = (out / "report.html").read_text()
     shown = [part.split('"')[0] for part in page.split('src="')[1:]]
     assert len(shown) > 10
