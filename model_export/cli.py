@@ -67,6 +67,9 @@ def train(
     weights: Annotated[
         Path | None, typer.Option(help="checkpoint or model folder whose weights a new run begins with", exists=True)
     ] = None,
+    fresh_decoders: Annotated[
+        bool, typer.Option("--fresh-decoders", help="of --weights the encoders alone: decoders and heads begin anew")
+    ] = False,
     teacher: Annotated[
         Path | None, typer.Option(help="checkpoint or model folder whose answers are learned too", exists=True)
     ] = None,
@@ -86,7 +89,15 @@ def train(
     )
     try:
         path = run_training(
-            config, textures, run, frames=frames, weights=weights, teacher=teacher, workers=workers, device=device
+            config,
+            textures,
+            run,
+            frames=frames,
+            weights=weights,
+            fresh_decoders=fresh_decoders,
+            teacher=teacher,
+            workers=workers,
+            device=device,
         )
     except (FileNotFoundError, ValueError) as exc:
         raise _fail(str(exc)) from exc

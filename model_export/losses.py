@@ -19,6 +19,9 @@ from service.optics import thin_lens
 DEFOCUS_FLOOR_PX = 0.05
 BETA = 0.5
 SIDE_VISIBLE_PX = 0.3
+STANDING_OUT = 3.0
+AROUND = 33  # cells of the networks' resolution, across
+FULLY_OUT = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +77,17 @@ def _reduced(excess: Tensor, stride: int) -> Tensor:
     return excess[:, :, ::stride, ::stride]
 
 
+def standing_out(log_truth: Tensor) -> Tensor:
+    """Weights [n,1,h,w] of mean 1: up to four times as much where the truth is unlike the mean of what is around.
+
+    Most pixels are like their surroundings, so that to answer those everywhere costs little: a chair becomes the wall.
+    """
+    padded = functional.pad(log_truth, (AROUND // 2,) * 4, mode="replicate")
+    unlike = (log_truth - functional.avg_pool2d(padded, AROUND, stride=1)).abs()
+    weight = 1 + STANDING_OUT * (unlike / FULLY_OUT).clamp(max=1)
+    return weight / weight.mean()
+
+
 def likeness_loss(blur: BlurEstimate, depth: DepthEstimate, teacher: Pair, batch: Batch) -> Tensor:
     """How far the answers are from a teacher's, most where it is sure: float32 scalar."""
     with torch.no_grad():
@@ -104,8 +118,8 @@ def total_loss(
     asked = (batch.side[:, None, None, None] * excess <= 0).float()
     side_seen = asked * (defocus_px > SIDE_VISIBLE_PX)
     side = functional.binary_cross_entropy_with_logits(depth.near_logit, is_near, weight=side_seen)
-    blur_loss = laplace(blur_error, blur.log_error).mean()
-    depth_loss = (asked * laplace(depth_error, depth.log_scale)).mean()
+    blur_loss = (standing_out(torch.log(true_blur)) * laplace(blur_error, blur.log_error)).mean()
+    depth_loss = (asked * standing_out(torch.log1p(excess)) * laplace(depth_error, depth.log_scale)).mean()
     loss = depth_loss + config.b_weight * blur_loss + config.side_weight * side
     parts = {"loss": loss, "blur": blur_error.mean(), "depth": (asked * depth_error).sum() / asked.sum(), "side": side}
     if teacher is not None:

@@ -463,5 +463,14 @@ def make_pair(kind: Kind, widths: Widths = SHIPPED_WIDTHS) -> Pair:
     return Pair(kind, PaperBlur(), PaperDepth(), stride=1)
 
 
+def with_fresh_decoders(pair: Pair) -> Pair:
+    """The pair's encoders below decoders and heads that begin anew, with random weights (seed torch before)."""
+    own = pair.modules().state_dict()
+    fresh = make_pair(pair.kind, Widths.of(own))
+    kept = {name: value for name, value in own.items() if not {"decoder", "head"} & set(name.split("."))}
+    fresh.modules().load_state_dict(fresh.modules().state_dict() | kept)
+    return fresh
+
+
 def parameter_count(pair: Pair) -> int:
     return sum(p.numel() for p in pair.modules().parameters())

@@ -27,7 +27,7 @@ from model_export.cores import torch_threads
 from model_export.folded import folded
 from model_export.frames import load_frames
 from model_export.losses import Batch, run_pair, total_loss
-from model_export.networks import SHIPPED_WIDTHS, Pair, Widths, make_pair
+from model_export.networks import SHIPPED_WIDTHS, Pair, Widths, make_pair, with_fresh_decoders
 from model_export.optimizers import Optimizers
 from model_export.progress import progress_bar
 from model_export.restored import restored, spread_norms
@@ -326,6 +326,7 @@ def train(
     *,
     frames: Path | None = None,
     weights: Path | None = None,
+    fresh_decoders: bool = False,
     teacher: Path | None = None,
     workers: int = 1,
     device: str = "cpu",
@@ -333,16 +334,17 @@ def train(
 ) -> Path:
     """Train in folder ``run``, going on from its checkpoint if there is one; the path of the last checkpoint.
 
-    A run without a checkpoint begins with the ``weights`` of a checkpoint or a model folder, or with random ones. A
-    ``teacher``, either too, is one whose answers are learned beside the truth. Torch computes on the cores that
-    ``workers`` leave, so other workers are another run by rounding.
+    A run without a checkpoint begins with the ``weights`` of a checkpoint or a model folder, or with random ones; with
+    ``fresh_decoders`` only with those of the encoders. A ``teacher``, a checkpoint or a folder too, is one whose
+    answers are learned beside the truth. Torch computes on the cores that ``workers`` leave, so other workers are
+    another run by rounding.
     Raises ``ValueError`` for weights of another kind, and for a run with a teacher that is gone on with without one.
     """
     console = console or Console(stderr=True)
     material = Material(load_photographs(textures), [] if frames is None else load_frames(frames))
     run.mkdir(parents=True, exist_ok=True)
     path = run / "checkpoint.pt"
-    trainer, start = _opened(config, path, weights, teacher, device)
+    trainer, start = _opened(config, path, weights, teacher, device, fresh_decoders=fresh_decoders)
     config = trainer.config
     pool = Pool(config, material, trainer.step, workers)
     test = held_out(config.scenes, material, 2 * config.batch)
@@ -354,7 +356,7 @@ def train(
         if start is not None and weights is not None:
             if weights.is_dir():
                 spread_norms(start, (partial(run_pair, start, batch) for batch in pool.settling()))
-            trainer.begin_with(start)
+            trainer.begin_with(with_fresh_decoders(start) if fresh_decoders else start)
         task = progress.add_task("training", total=config.steps, completed=trainer.step)
         recent: list[dict[str, float]] = []
         pace = Pace()
@@ -373,11 +375,12 @@ def train(
 
 
 def _opened(
-    config: TrainConfig, path: Path, weights: Path | None, teacher: Path | None, device: str
+    config: TrainConfig, path: Path, weights: Path | None, teacher: Path | None, device: str, *, fresh_decoders: bool
 ) -> tuple[Trainer, Pair | None]:
     """The trainer of a run, as its checkpoint left it if there is one, and the networks that a new run begins with.
 
-    With such networks the norms' statistics stay as they are: a batch's own would undo much of what was learned.
+    With such networks the norms' statistics stay as they are, but where decoders begin anew: a batch's own would undo
+    much of what was learned.
     """
     resume = Checkpoint.load(path) if path.exists() else None
     if resume is not None and resume.config.taught != (teacher is not None):
@@ -389,7 +392,8 @@ def _opened(
         trainer = Trainer(replace(config, settled_share=resume.config.settled_share), device, resume)
     elif start is not None:
         widths = Widths.of(start.modules().state_dict())
-        trainer = Trainer(replace(config, settled_share=1.0), device, widths=widths)
+        begun = config if fresh_decoders else replace(config, settled_share=1.0)
+        trainer = Trainer(begun, device, widths=widths)
     else:
         trainer = Trainer(config, device)
     if teacher is not None:

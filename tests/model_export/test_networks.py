@@ -8,7 +8,7 @@ from torch.nn import functional
 
 from model_export.config import Kind, TrainConfig
 from model_export.folded import folded
-from model_export.losses import Batch, correct, run_pair, total_loss
+from model_export.losses import STANDING_OUT, Batch, correct, run_pair, standing_out, total_loss
 from model_export.networks import LUMINANCE, BandEnergy, Surroundings, make_pair, parameter_count
 from model_export.render import blur
 
@@ -93,6 +93,17 @@ def test_every_weight_learns_from_the_joint_loss(kind: Kind) -> None:
     for name, weight in pair.modules().named_parameters():
         assert weight.grad is not None, name
         assert torch.isfinite(weight.grad).all(), name
+
+
+def test_what_is_unlike_its_surroundings_weighs_more() -> None:
+    level = torch.zeros(1, 1, 96, 96)
+    torch.testing.assert_close(standing_out(level), torch.ones_like(level))
+    post = level.clone()
+    post[..., 46:50] = 1.0
+    weight = standing_out(post)
+    assert float(weight.mean()) == pytest.approx(1, abs=1e-5)
+    assert float(weight[..., 47].mean() / weight[..., 0].mean()) == pytest.approx(1 + STANDING_OUT)
+    assert float(weight[..., 44].mean()) < 0.5 * float(weight[..., 47].mean())
 
 
 def test_b_weight_scales_the_blur_loss_alone() -> None:

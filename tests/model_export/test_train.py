@@ -17,7 +17,7 @@ from model_export.config import SceneConfig, TrainConfig
 from model_export.cores import torch_threads
 from model_export.folded import folded
 from model_export.losses import run_pair, total_loss
-from model_export.networks import Widths, make_pair
+from model_export.networks import Widths, make_pair, with_fresh_decoders
 from model_export.restored import restored, spread_norms
 from model_export.scenes import Material, draw_sample
 from model_export.textures import load_photographs
@@ -103,6 +103,36 @@ def test_a_new_run_goes_on_from_a_model_folder() -> None:
     trainer.begin_with(start)
     begun, shipped = folded(trainer.pair).modules(), folded(restored(SHIPPED)).modules()
     torch.testing.assert_close(begun.state_dict(), shipped.state_dict(), rtol=1e-3, atol=1e-4)
+
+
+def test_decoders_that_begin_anew_leave_the_encoders_as_they_were() -> None:
+    torch.manual_seed(1)
+    pair = starting_pair(SHIPPED, "compact")
+    before, after = pair.modules().state_dict(), with_fresh_decoders(pair).modules().state_dict()
+    fresh = {name for name, own in before.items() if not torch.equal(own, after[name])}
+    assert {name.split(".head.")[0].split(".decoder.")[0] for name in fresh} == {
+        "blur",
+        "blur.unet",
+        "depth",
+        "depth.unet",
+    }
+    assert not any(".encoder." in name or ".surroundings." in name for name in fresh)
+
+
+def test_norms_move_where_decoders_begin_anew(textures: Path, tmp_path: Path) -> None:
+    first, _ = run(CONFIG, textures, tmp_path / "first")
+    path = train(
+        replace(CONFIG, seed=2),
+        textures,
+        tmp_path / "second",
+        weights=tmp_path / "first" / "checkpoint.pt",
+        fresh_decoders=True,
+        workers=0,
+        console=Console(file=StringIO()),
+    )
+    second = Checkpoint.load(path)
+    assert second.config.settled_share == CONFIG.settled_share
+    assert not any(torch.equal(second.modules[name], own) for name, own in first.modules.items() if "running" in name)
 
 
 def test_a_run_that_begins_with_weights_keeps_their_statistics(textures: Path, tmp_path: Path) -> None:
