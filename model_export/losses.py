@@ -119,7 +119,7 @@ def total_loss(
     side_seen = asked * (defocus_px > SIDE_VISIBLE_PX)
     side = functional.binary_cross_entropy_with_logits(depth.near_logit, is_near, weight=side_seen)
     blur_loss = (standing_out(torch.log(true_blur)) * laplace(blur_error, blur.log_error)).mean()
-    depth_loss = (asked * standing_out(torch.log1p(excess)) * laplace(depth_error, depth.log_scale)).mean()
+    depth_loss = (asked * standing_out(torch.log1p(asked * excess)) * laplace(depth_error, depth.log_scale)).mean()
     loss = depth_loss + config.b_weight * blur_loss + config.side_weight * side
     parts = {"loss": loss, "blur": blur_error.mean(), "depth": (asked * depth_error).sum() / asked.sum(), "side": side}
     if teacher is not None:
