@@ -82,8 +82,10 @@ def standing_out(log_truth: Tensor) -> Tensor:
 
     Most pixels are like their surroundings, so that to answer those everywhere costs little: a chair becomes the wall.
     """
-    padded = functional.pad(log_truth, (AROUND // 2,) * 4, mode="replicate")
-    unlike = (log_truth - functional.avg_pool2d(padded, AROUND, stride=1)).abs()
+    around = functional.pad(log_truth, (AROUND // 2,) * 4, mode="replicate")
+    for window in ((AROUND, 1), (1, AROUND)):  # down, then across: a seventeenth of the work
+        around = functional.avg_pool2d(around, window, stride=1)
+    unlike = (log_truth - around).abs()
     weight = 1 + STANDING_OUT * (unlike / FULLY_OUT).clamp(max=1)
     return weight / weight.mean()
 
