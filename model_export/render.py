@@ -201,7 +201,7 @@ def _filled(image: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np.
     )
     colors = np.zeros((int(labels.max()) + 1, 3), np.float32)
     colors[labels[known]] = image[known]
-    return np.take(colors, labels, axis=0)
+    return np.take(colors, np.asarray(labels, np.int32), axis=0)
 
 
 def _slice(linear: NDArray[np.float32], index: NDArray[np.int32], number: int) -> tuple[Tensor, Tensor]:

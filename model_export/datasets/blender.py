@@ -12,9 +12,12 @@ import shutil
 import subprocess
 import tempfile
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from threading import Lock
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -22,6 +25,7 @@ import torch
 from numpy.typing import NDArray
 
 from model_export.render import DISC, blur
+from service.cores import available_cores
 from service.optics import thin_lens
 from service.optics.light import encode_srgb
 
@@ -37,6 +41,7 @@ GAMMA_PX = 0.5
 MILLIMETRES = 1000.0
 
 Map = NDArray[np.float32]
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,27 +114,44 @@ def render(python: Path, scenes: list[Scene], out: Path, on_progress: Callable[[
 
     Raises ``RuntimeError`` with the worker's last words if it fails.
     """
-    run_worker(python, WORKER, [asdict(scene) for scene in scenes], out, on_progress)
+    run_workers(python, WORKER, shares([asdict(scene) for scene in scenes]), out, on_progress)
 
 
-def run_worker(python: Path, worker: Path, spec: object, out: Path, on_progress: Callable[[str], None]) -> None:
-    """Have Blender's Python run a script on a specification in JSON and a folder; each file's name as it is done.
+def shares(items: Sequence[Item]) -> list[list[Item]]:
+    """Each core's part of a work, as nearly alike as may be; at least one part."""
+    count = max(1, min(available_cores(), len(items)))
+    return [list(items[first::count]) for first in range(count)]
 
-    Raises ``RuntimeError`` with the script's last words if it fails.
+
+def run_workers(
+    python: Path, worker: Path, specs: Sequence[object], out: Path, on_progress: Callable[[str], None]
+) -> None:
+    """Have Blender's Python run a script on each specification in JSON and a folder; each file's name as it is done.
+
+    The scripts run side by side, each on a core of its own: making a scene ready takes one however many there are.
+    Raises ``RuntimeError`` with the last words of one that fails.
     """
     out.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory() as scratch:
-        told = Path(scratch) / "spec.json"
-        told.write_text(json.dumps(spec))
-        command = [str(python), str(worker), str(told), str(out)]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as running:
-            said: deque[str] = deque(maxlen=10)
-            for line in running.stdout or ():
-                said.append(line)
-                if line.startswith("rendered "):
-                    on_progress(line.split()[1])
-        if running.returncode:
-            raise RuntimeError(f"Blender failed: {''.join(said)}")
+    telling = Lock()
+
+    def run(spec: object) -> None:
+        with tempfile.TemporaryDirectory() as scratch:
+            told = Path(scratch) / "spec.json"
+            told.write_text(json.dumps(spec))
+            command = [str(python), str(worker), str(told), str(out)]
+            with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as running:
+                said: deque[str] = deque(maxlen=10)
+                for line in running.stdout or ():
+                    said.append(line)
+                    if line.startswith("rendered "):
+                        with telling:
+                            on_progress(line.split()[1])
+            if running.returncode:
+                raise RuntimeError(f"Blender failed: {''.join(said)}")
+
+    with ThreadPoolExecutor(len(specs)) as pool:
+        for _ in pool.map(run, specs):
+            pass
 
 
 def sharp_edge(size_px: int) -> Map:

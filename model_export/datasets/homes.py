@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from model_export.datasets.blender import MILLIMETRES, run_worker
+from model_export.datasets.blender import MILLIMETRES, run_workers, shares
 from model_export.textures import picture_files
 from service.optics.light import encode_srgb
 
@@ -135,8 +135,8 @@ def render(
         on_progress(name)
 
     pictures = [str(path) for path in picture_files(textures)]
-    spec = {"models": [asdict(model) for model in models], "pictures": pictures, "rooms": rooms}
-    run_worker(python, WORKER, spec, raw, develop)
+    common = {"models": [asdict(model) for model in models], "pictures": pictures}
+    run_workers(python, WORKER, [common | {"rooms": share} for share in shares(rooms)], raw, develop)
 
 
 def _developed(rendered: Path, out: Path) -> dict[str, float] | None:

@@ -19,8 +19,10 @@ from model_export.datasets.blender import (
     environment,
     render,
     rooms,
+    shares,
     sharp_edge,
 )
+from service.cores import available_cores
 from service.optics import thin_lens
 
 RENDERS = Path(__file__).parent / "renders"
@@ -71,6 +73,14 @@ def test_rooms_become_a_set_with_their_cameras(tmp_path: Path) -> None:
         sigma = thin_lens.defocus_from_blur(float(case.blur_px[30, 30]), GAMMA_PX)
         assert sigma == pytest.approx(0.5 * scene.k_cam_px, rel=5e-3)  # millimetres
     assert set(json.loads((tmp_path / "cameras.json").read_text())) == {scene.name for scene in scenes}
+
+
+def test_every_core_has_its_share_of_the_scenes() -> None:
+    parts = shares(rooms(5))
+    assert len(parts) == min(5, available_cores())
+    assert sorted((scene for part in parts for scene in part), key=lambda scene: scene.name) == rooms(5)
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+    assert shares([]) == [[]]
 
 
 def test_a_worker_that_fails_is_said(tmp_path: Path) -> None:
