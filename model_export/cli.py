@@ -24,7 +24,7 @@ Kind = Annotated[str, typer.Option(help="compact (ours) or paper")]
 Model = Annotated[Path, typer.Option(help="model folder", file_okay=False)]
 Textures = Annotated[Path, typer.Option(help="folder of pictures with LICENCES.md", exists=True, file_okay=False)]
 Frames = Annotated[
-    Path | None, typer.Option(help="sharp pictures with depth, of camind homes: half of the scenes", exists=True)
+    Path | None, typer.Option(help="sharp pictures with depth, of camind homes: four scenes in ten", exists=True)
 ]
 Checkpoint = Annotated[Path, typer.Option(help="checkpoint file of a run", exists=True, dir_okay=False)]
 

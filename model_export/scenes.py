@@ -26,12 +26,8 @@ BOTH_SIDES_SHARE = 0.55  # something before and something beyond what is in focu
 # focus shows is mostly nearer
 USUAL_DEPTH_M, DEPTH_SPREAD = 2.0, 1.2  # median, and standard deviation of the logarithm
 LIKELIEST_SIDE = 0.85
-ROOM_SHARE = 0.5
-WALL_SHARE = 0.2  # nothing but a wall: what people photograph first, and what rooms seldom hold
 LEVEL_SHARE = 0.5
-LAYERED_SHARE = 0.7
 NEAREST_AT_MOST, FARTHEST_AT_LEAST = 0.5, 2.0
-CLOSE_SHARE = 0.5
 FOCUSED_SHARE = 0.2  # somebody focused on something: sharp is read as blurred by who seldom saw it
 K_CAM_LEAN = 0.5  # so that every octave of blur has about its share: what is rare is read as what is common
 DISC_SHARE, GAUSSIAN_SHARE = 0.5, 0.2  # lenses have discs, softened where they are soft; fewer come near a bell
@@ -44,7 +40,6 @@ MOSAIC_SHARE = 0.4
 MOSAIC_VARIANCE = 0.35  # what a bilinear demosaic adds to luminance, px^2
 SHOT_NOISE, READ_NOISE = (1e-6, 2e-3), (1e-4, 4e-3)
 GRAINY_SHARE, GRAIN = 0.25, (3e-4, 3e-3)  # dim light: grain must not pass for sharpness
-FRAME_SHARE = 0.5  # of scenes, where there are frames
 MOSTLY = 0.98
 PLAIN_SHARE = 0.35  # not compressed: the network must not need the noise of JPEG
 RESCALED_SHARE = 0.15
@@ -92,6 +87,11 @@ def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float], lean: fl
     """Between the bounds, uniform in the logarithm; a ``lean`` below 1 leans to the upper one."""
     low, high = math.log(bounds[0]), math.log(bounds[1])
     return math.exp(low + (high - low) * rng.random() ** lean)
+
+
+def _by_chance(rng: np.random.Generator, share: float) -> bool:
+    """True that often. What never happens draws nothing, so a seed's scene stays what it was."""
+    return share > 0 and rng.random() < share
 
 
 def _nearer_share(focus_distance_m: float) -> float:
@@ -198,7 +198,8 @@ def _apart(rng: np.random.Generator, shot: Shot, config: SceneConfig, count: int
     """Alpha and q - 1 of shapes before a background, nearest first, at depths that say little of where they are."""
     bounds = _excess_bounds(shot, config)
     first, *others = (_draw_excess(rng, shot, config) for _ in range(count))
-    apart = rng.uniform(0, 1) if rng.random() < CLOSE_SHARE else 1.0  # what stands together is often alike in depth
+    # what stands together is often alike in depth
+    apart = rng.uniform(0, 1) if rng.random() < config.close_share else 1.0
     middles = sorted((first, *(first + apart * (other - first) for other in others)), reverse=True)
     *shapes, background = [_surface(rng, middle, bounds, size) for middle in middles]
     return [*((_outline(rng, size), shape) for shape in shapes), (np.ones((size, size), np.float32), background)]
@@ -214,13 +215,13 @@ def draw_layers(
         return draw_texture(rng, photographs, texture_size)
 
     kind = rng.random()
-    if kind < WALL_SHARE:
+    if kind < config.wall_share:  # what people photograph first, and what rooms seldom hold
         alpha = np.ones((size, size), np.float32)
         middle = _draw_excess(rng, shot, config)
         level = rng.random() < LEVEL_SHARE
         excess = alpha * np.float32(middle) if level else _surface(rng, middle, _excess_bounds(shot, config), size)
         surfaces = [Surface(decode_srgb(draw(size)), alpha, excess)]
-    elif kind < WALL_SHARE + ROOM_SHARE:
+    elif kind < config.wall_share + config.room_share:
         far, near = sorted(_draw_excess(rng, shot, config) for _ in range(2))
         surfaces = draw_room(
             rng,
@@ -232,7 +233,7 @@ def draw_layers(
             size=size,
         )
     else:
-        count = int(rng.integers(1, config.max_layers + 1)) if rng.random() < LAYERED_SHARE else 1
+        count = int(rng.integers(1, config.max_layers + 1)) if rng.random() < config.layered_share else 1
         surfaces = [
             Surface(decode_srgb(draw(size)) * alpha[..., None], alpha, excess)
             for alpha, excess in _apart(rng, shot, config, count, size)
@@ -263,6 +264,10 @@ def develop(rng: np.random.Generator, linear: Map, config: SceneConfig, *, throu
     shot_noise = _log_uniform(rng, GRAIN if rng.random() < GRAINY_SHARE else SHOT_NOISE)
     read_noise = _log_uniform(rng, READ_NOISE)
     noise = rng.standard_normal(picture.shape).astype(np.float32)
+    if not through_mosaic and _by_chance(rng, config.grey_share):  # as denoisers leave it, and ray tracing makes it
+        noise[:] = noise[..., :1]
+    if _by_chance(rng, config.clean_share):  # what is smooth then ends in steps of one grey level
+        noise[:] = 0
     spread = rng.uniform(0, 0.9)
     if spread > 0.3 and not through_mosaic:  # filters make noise of neighbours alike
         noise = np.asarray(cv2.GaussianBlur(noise, (0, 0), spread)) * np.float32(1 + 1.5 * spread)
@@ -308,7 +313,7 @@ def draw_sample(seed: int, config: SceneConfig, material: Material = NOTHING) ->
     """The scene of this seed: the same seed, config and material give the same sample."""
     rng = np.random.default_rng(seed)
     shot = draw_shot(rng, config)
-    if material.frames and rng.random() < FRAME_SHARE:
+    if material.frames and rng.random() < config.frame_share:
         shot, layers, excesses = _frame_layers(
             rng, shot, config, material.frames[int(rng.integers(len(material.frames)))]
         )

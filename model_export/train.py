@@ -206,6 +206,13 @@ def learning_rate(config: TrainConfig, step: int) -> float:
     return config.learning_rate * min(1.0, (step + 1) / config.warmup_steps, left)
 
 
+def emphasis(config: TrainConfig, step: int) -> float:
+    """How much more what stands out weighs: less and less, no more once the rate falls or where a run goes on."""
+    if config.settled_share == 1:
+        return 0.0
+    return max(0.0, 1 - step / max(1.0, config.steps * (1 - config.decay_share)))
+
+
 def settling_step(config: TrainConfig) -> int:
     """The step before which the batch norms' statistics are settled for good."""
     return round(config.steps * (1 - config.settled_share))
@@ -261,7 +268,7 @@ class Trainer:
             for norm in self._norms():
                 norm.eval()
         with self.autocast():
-            loss, parts = total_loss(self.pair, batch, self.config, self.teacher)
+            loss, parts = total_loss(self.pair, batch, self.config, self.teacher, emphasis(self.config, self.step))
         self.modules.zero_grad(set_to_none=True)
         torch.autograd.backward(loss)
         torch.nn.utils.clip_grad_norm_(self.modules.parameters(), self.config.clip_norm)

@@ -104,6 +104,7 @@ def test_what_is_unlike_its_surroundings_weighs_more() -> None:
     assert float(weight.mean()) == pytest.approx(1, abs=1e-5)
     assert float(weight[..., 47].mean() / weight[..., 0].mean()) == pytest.approx(1 + STANDING_OUT)
     assert float(weight[..., 44].mean()) < 0.5 * float(weight[..., 47].mean())
+    torch.testing.assert_close(standing_out(post, 0.0), torch.ones_like(post))
 
 
 def test_b_weight_scales_the_blur_loss_alone() -> None:

@@ -1,11 +1,14 @@
 """Procedural scenes: the same seed is the same scene, and every scene is what its shot says."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from model_export import scenes
 from model_export.config import SceneConfig
-from model_export.scenes import draw_sample, draw_shot, true_blur_px
+from model_export.scenes import develop, draw_sample, draw_shot, true_blur_px
 
 CONFIG = SceneConfig(size_px=64, margin_px=24)
 SEEDS = range(30)
@@ -43,11 +46,24 @@ def test_all_sides_and_lens_shapes_turn_up() -> None:
 
 
 def test_some_scenes_are_nothing_but_a_level_wall(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scenes, "WALL_SHARE", 1.0)
     monkeypatch.setattr(scenes, "LEVEL_SHARE", 1.0)
     monkeypatch.setattr(scenes, "RESCALED_SHARE", 0.0)
     for seed in range(4):
-        assert np.ptp(draw_sample(seed, CONFIG).excess) == 0
+        assert np.ptp(draw_sample(seed, replace(CONFIG, wall_share=1.0)).excess) == 0
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_noise_is_left_out_or_alike_in_all_colours_where_it_is_asked_for(seed: int) -> None:
+    grey = np.full((32, 32, 3), 0.2, np.float32)
+
+    def deviations(config: SceneConfig) -> NDArray[np.float64]:
+        pixels = develop(np.random.default_rng(seed), grey, config, through_mosaic=False).astype(np.float64)
+        return np.asarray(pixels - pixels.mean((0, 1)))
+
+    plain = replace(CONFIG, jpeg_quality=(100, 100))
+    assert deviations(replace(plain, clean_share=1.0)) == pytest.approx(0, abs=0.01)
+    alike, apart = (np.ptp(deviations(replace(plain, grey_share=share)), 2).mean() for share in (1.0, 0.0))
+    assert alike < max(1.0, 0.5 * apart)  # white balance and rounding remain
 
 
 def test_most_lenses_blur_red_and_blue_more_before_the_focus_than_beyond() -> None:

@@ -26,6 +26,7 @@ from model_export.train import (
     Pool,
     Trainer,
     collate,
+    emphasis,
     learning_rate,
     settling_step,
     starting_pair,
@@ -235,6 +236,12 @@ def test_the_learning_rate_warms_up_holds_and_falls_to_nothing() -> None:
     assert learning_rate(config, 0) < learning_rate(config, 50) < learning_rate(config, 100)
     assert learning_rate(config, 100) == learning_rate(config, 500) == config.learning_rate
     assert learning_rate(config, 999) < 0.01 * config.learning_rate
+
+
+def test_what_stands_out_weighs_no_more_once_the_rate_falls() -> None:
+    config = TrainConfig(steps=1000, decay_share=0.4)
+    assert [emphasis(config, step) for step in (0, 300, 600, 999)] == pytest.approx([1, 0.5, 0, 0])
+    assert learning_rate(config, 599) == config.learning_rate > learning_rate(config, 601)
 
 
 def test_a_config_survives_json() -> None:
