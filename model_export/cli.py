@@ -71,7 +71,10 @@ def train(
         bool, typer.Option("--fresh-decoders", help="of --weights the encoders alone: decoders and heads begin anew")
     ] = False,
     teacher: Annotated[
-        Path | None, typer.Option(help="checkpoint or model folder whose answers are learned too", exists=True)
+        list[Path] | None,
+        typer.Option(
+            help="checkpoint or model folder to learn the answers of, too; of several their mean", exists=True
+        ),
     ] = None,
     learning_rate: Annotated[float, typer.Option(min=1e-6, max=1e-2, help="before it falls")] = 1e-3,
     workers: Annotated[int, typer.Option(min=0, max=64, help="processes that draw scenes")] = 1,
@@ -95,7 +98,7 @@ def train(
             frames=frames,
             weights=weights,
             fresh_decoders=fresh_decoders,
-            teacher=teacher,
+            teachers=teacher or (),
             workers=workers,
             device=device,
         )

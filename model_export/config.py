@@ -54,7 +54,7 @@ class TrainConfig:
     """A training run: ``steps`` batches, drawn from a pool that ``fresh_per_step`` new scenes flow through.
 
     The last ``settled_share`` of the steps has the batch norms' statistics fixed, as the exported network has: all of
-    them in a run that begins with weights, decoders' too. A ``taught`` run learns a teacher's answers too.
+    them in a run that begins with weights, decoders' too. A ``taught`` run learns teachers' answers too.
     """
 
     kind: Kind = "compact"

@@ -1,5 +1,6 @@
 """What training minimises: L_depth + b_weight * L_blur (eq. 8), each a likelihood, so that errors are stated."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -92,10 +93,22 @@ def standing_out(log_truth: Tensor, emphasis: float = 1.0) -> Tensor:
     return weight / weight.mean()
 
 
-def likeness_loss(blur: BlurEstimate, depth: DepthEstimate, teacher: Pair, batch: Batch) -> Tensor:
-    """How far the answers are from a teacher's, most where it is sure: float32 scalar."""
+def told_by(teachers: Sequence[Pair], batch: Batch) -> tuple[BlurEstimate, DepthEstimate]:
+    """What pairs answer on average, in logarithms and logits: of different descent, they err differently."""
+
+    def mean(maps: Iterable[Tensor]) -> Tensor:
+        return torch.stack(list(maps)).mean(0)
+
     with torch.no_grad():
-        wise_blur, wise_depth = run_pair(teacher, batch)
+        blurs, depths = zip(*(run_pair(teacher, batch) for teacher in teachers), strict=True)
+        blur_px = torch.exp(mean(torch.log(blur.blur_px) for blur in blurs))
+        depth = DepthEstimate(*(mean(getattr(depth, name) for depth in depths) for name in DepthEstimate.__slots__))
+        return BlurEstimate(blur_px, mean(blur.log_error for blur in blurs), ()), depth
+
+
+def likeness_loss(blur: BlurEstimate, depth: DepthEstimate, teachers: Sequence[Pair], batch: Batch) -> Tensor:
+    """How far the answers are from the teachers', most where these are sure: float32 scalar."""
+    wise_blur, wise_depth = told_by(teachers, batch)
     sure_blur = torch.exp(-BETA * wise_blur.log_error)
     sure_depth = torch.exp(-BETA * wise_depth.log_scale) / 2
     of_blur = sure_blur * (torch.log(blur.blur_px) - torch.log(wise_blur.blur_px)).abs()
@@ -108,9 +121,9 @@ def likeness_loss(blur: BlurEstimate, depth: DepthEstimate, teacher: Pair, batch
 
 
 def total_loss(
-    pair: Pair, batch: Batch, config: TrainConfig, teacher: Pair | None = None, emphasis: float = 0.0
+    pair: Pair, batch: Batch, config: TrainConfig, teachers: Sequence[Pair] = (), emphasis: float = 0.0
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """The loss of a batch and its parts by name, all float32 scalars; a teacher's part is ``likeness_weight``.
+    """The loss of a batch and its parts by name, all float32 scalars; the teachers' part is ``likeness_weight``.
 
     ``emphasis`` is that of what stands out.
     """
@@ -130,7 +143,7 @@ def total_loss(
     depth_loss = (asked * of_depth * laplace(depth_error, depth.log_scale)).mean()
     loss = depth_loss + config.b_weight * blur_loss + config.side_weight * side
     parts = {"loss": loss, "blur": blur_error.mean(), "depth": (asked * depth_error).sum() / asked.sum(), "side": side}
-    if teacher is not None:
-        parts["likeness"] = likeness_loss(blur, depth, teacher, batch)
+    if teachers:
+        parts["likeness"] = likeness_loss(blur, depth, teachers, batch)
         parts["loss"] = loss + config.likeness_weight * parts["likeness"]
     return parts["loss"], {name: part.detach() for name, part in parts.items()}

@@ -8,7 +8,7 @@ import math
 import os
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -239,7 +239,7 @@ class Trainer:
         self.modules = self.pair.modules().to(self.device)
         convert_conv2d_weight_memory_format(self.modules, torch.channels_last)
         self.optimizers = Optimizers(self.modules, config.weight_decay)
-        self.teacher: Pair | None = None
+        self.teachers: list[Pair] = []
         self.step = 0
         if resume is not None:
             if not resume.optimizers:
@@ -252,10 +252,11 @@ class Trainer:
         """Take over other networks' weights."""
         self.modules.load_state_dict(pair.modules().state_dict())
 
-    def learn_from(self, teacher: Pair) -> None:
-        """Have what a batch costs include how far the answers are from another pair's."""
-        self.teacher = folded(teacher)
-        convert_conv2d_weight_memory_format(self.teacher.modules().to(self.device), torch.channels_last)
+    def learn_from(self, *teachers: Pair) -> None:
+        """Have what a batch costs include how far the answers are from the mean of other pairs'."""
+        self.teachers = [folded(teacher) for teacher in teachers]
+        for teacher in self.teachers:
+            convert_conv2d_weight_memory_format(teacher.modules().to(self.device), torch.channels_last)
 
     def autocast(self) -> torch.autocast:
         """bfloat16 where the hardware computes it; emulated on an older processor it is ten times slower."""
@@ -268,7 +269,7 @@ class Trainer:
             for norm in self._norms():
                 norm.eval()
         with self.autocast():
-            loss, parts = total_loss(self.pair, batch, self.config, self.teacher, emphasis(self.config, self.step))
+            loss, parts = total_loss(self.pair, batch, self.config, self.teachers, emphasis(self.config, self.step))
         self.modules.zero_grad(set_to_none=True)
         torch.autograd.backward(loss)
         torch.nn.utils.clip_grad_norm_(self.modules.parameters(), self.config.clip_norm)
@@ -300,7 +301,7 @@ class Trainer:
         """The loss's parts on held-out scenes, networks in evaluation mode."""
         self.modules.eval()
         with torch.inference_mode(), self.autocast():
-            _, parts = total_loss(self.pair, batch, self.config, self.teacher)
+            _, parts = total_loss(self.pair, batch, self.config, self.teachers)
         return {name: float(part) for name, part in parts.items()}
 
     def checkpoint(self) -> Checkpoint:
@@ -334,7 +335,7 @@ def train(
     frames: Path | None = None,
     weights: Path | None = None,
     fresh_decoders: bool = False,
-    teacher: Path | None = None,
+    teachers: Sequence[Path] = (),
     workers: int = 1,
     device: str = "cpu",
     console: Console | None = None,
@@ -342,16 +343,16 @@ def train(
     """Train in folder ``run``, going on from its checkpoint if there is one; the path of the last checkpoint.
 
     A run without a checkpoint begins with the ``weights`` of a checkpoint or a model folder, or with random ones; with
-    ``fresh_decoders`` only with those of the encoders. A ``teacher``, a checkpoint or a folder too, is one whose
-    answers are learned beside the truth. Torch computes on the cores that ``workers`` leave, so other workers are
-    another run by rounding.
-    Raises ``ValueError`` for weights of another kind, and for a run with a teacher that is gone on with without one.
+    ``fresh_decoders`` only with those of the encoders. ``teachers``, checkpoints or folders too, are those whose
+    answers, on average, are learned beside the truth. Torch computes on the cores that ``workers`` leave, so other
+    workers are another run by rounding.
+    Raises ``ValueError`` for weights of another kind, and for a run with teachers that is gone on with without.
     """
     console = console or Console(stderr=True)
     material = Material(load_photographs(textures), [] if frames is None else load_frames(frames))
     run.mkdir(parents=True, exist_ok=True)
     path = run / "checkpoint.pt"
-    trainer, start = _opened(config, path, weights, teacher, device, fresh_decoders=fresh_decoders)
+    trainer, start = _opened(config, path, weights, teachers, device, fresh_decoders=fresh_decoders)
     config = trainer.config
     pool = Pool(config, material, trainer.step, workers)
     test = held_out(config.scenes, material, 2 * config.batch)
@@ -382,7 +383,13 @@ def train(
 
 
 def _opened(
-    config: TrainConfig, path: Path, weights: Path | None, teacher: Path | None, device: str, *, fresh_decoders: bool
+    config: TrainConfig,
+    path: Path,
+    weights: Path | None,
+    teachers: Sequence[Path],
+    device: str,
+    *,
+    fresh_decoders: bool,
 ) -> tuple[Trainer, Pair | None]:
     """The trainer of a run, as its checkpoint left it if there is one, and the networks that a new run begins with.
 
@@ -390,10 +397,10 @@ def _opened(
     much of what was learned.
     """
     resume = Checkpoint.load(path) if path.exists() else None
-    if resume is not None and resume.config.taught != (teacher is not None):
+    if resume is not None and resume.config.taught != bool(teachers):
         how = "with" if resume.config.taught else "without"
         raise ValueError(f"{path.parent} was begun {how} a --teacher: go on {how} one")
-    config = replace(config, taught=teacher is not None)
+    config = replace(config, taught=bool(teachers))
     start = starting_pair(weights, config.kind) if weights is not None and resume is None else None
     if resume is not None:
         trainer = Trainer(replace(config, settled_share=resume.config.settled_share), device, resume)
@@ -403,8 +410,7 @@ def _opened(
         trainer = Trainer(begun, device, widths=widths)
     else:
         trainer = Trainer(config, device)
-    if teacher is not None:
-        trainer.learn_from(starting_pair(teacher, config.kind))
+    trainer.learn_from(*(starting_pair(teacher, config.kind) for teacher in teachers))
     return trainer, start
 
 

@@ -16,7 +16,7 @@ from rich.console import Console
 from model_export.config import SceneConfig, TrainConfig
 from model_export.cores import torch_threads
 from model_export.folded import folded
-from model_export.losses import run_pair, total_loss
+from model_export.losses import run_pair, told_by, total_loss
 from model_export.networks import Widths, make_pair, with_fresh_decoders
 from model_export.restored import restored, spread_norms
 from model_export.scenes import Material, draw_sample
@@ -231,6 +231,18 @@ def test_who_has_a_teacher_comes_to_answer_alike() -> None:
     assert apart(taught) < min(0.7 * before, apart(alone))
 
 
+def test_several_teachers_answer_as_their_mean() -> None:
+    batch = collate([draw_sample(i, SCENES) for i in range(2)], np.random.default_rng(0))
+    pairs = [make_pair("compact"), make_pair("compact")]
+    for pair in pairs:
+        pair.modules().eval()
+    (one_blur, one), (other_blur, other) = (told_by([pair], batch) for pair in pairs)
+    blur, depth = told_by(pairs, batch)
+    torch.testing.assert_close(blur.blur_px, (one_blur.blur_px * other_blur.blur_px).sqrt())
+    torch.testing.assert_close(depth.log_ratio_far, (one.log_ratio_far + other.log_ratio_far) / 2)
+    assert not torch.equal(one.near_logit, other.near_logit)
+
+
 def test_the_learning_rate_warms_up_holds_and_falls_to_nothing() -> None:
     config = TrainConfig(steps=1000, warmup_steps=100)
     assert learning_rate(config, 0) < learning_rate(config, 50) < learning_rate(config, 100)
@@ -255,8 +267,8 @@ def test_a_folder_without_pictures_is_said(tmp_path: Path) -> None:
 
 def test_a_run_that_began_with_a_teacher_goes_on_with_one(textures: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    path = train(replace(CONFIG, steps=3), textures, folder, teacher=SHIPPED, workers=0)
+    path = train(replace(CONFIG, steps=3), textures, folder, teachers=[SHIPPED], workers=0)
     assert Checkpoint.load(path).config.taught
     with pytest.raises(ValueError, match="begun with a --teacher: go on with one"):
         train(CONFIG, textures, folder, workers=0)
-    assert Checkpoint.load(train(CONFIG, textures, folder, teacher=SHIPPED, workers=0)).step == CONFIG.steps
+    assert Checkpoint.load(train(CONFIG, textures, folder, teachers=[SHIPPED], workers=0)).step == CONFIG.steps
