@@ -366,20 +366,29 @@ def train(
                 spread_norms(start, (partial(run_pair, start, batch) for batch in pool.settling()))
             trainer.begin_with(with_fresh_decoders(start) if fresh_decoders else start)
         task = progress.add_task("training", total=config.steps, completed=trainer.step)
-        recent: list[dict[str, float]] = []
-        pace = Pace()
-        while trainer.step < config.steps:
-            if trainer.step == settling_step(config) > 0:
-                trainer.settle(pool.settling())
-            recent.append(trainer.advance(pool.batch(trainer.step)))
-            with pace.waiting():
-                pool.refresh(trainer.step - 1)
+        for said in _steps(trainer, pool, test, path):
             progress.update(task, completed=trainer.step)
-            if trainer.step % config.checkpoint_every == 0 or trainer.step == config.steps:
-                trainer.checkpoint().save(path)
-                console.print(_report(trainer, recent, test, pace))
-                recent, pace = [], Pace()
+            if said is not None:
+                console.print(said)
     return path
+
+
+def _steps(trainer: Trainer, pool: Pool, test: Batch, path: Path) -> Iterator[str | None]:
+    """Take the steps that a run has left, one at a time; what there is to say where a checkpoint was saved."""
+    config, pace = trainer.config, Pace()
+    recent: list[dict[str, float]] = []
+    while trainer.step < config.steps:
+        if trainer.step == settling_step(config) > 0:
+            trainer.settle(pool.settling())
+        recent.append(trainer.advance(pool.batch(trainer.step)))
+        with pace.waiting():
+            pool.refresh(trainer.step - 1)
+        if trainer.step % config.checkpoint_every and trainer.step < config.steps:
+            yield None
+            continue
+        trainer.checkpoint().save(path)
+        yield _report(trainer, recent, test, pace)
+        recent, pace = [], Pace()
 
 
 def _opened(

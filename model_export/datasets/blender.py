@@ -126,32 +126,39 @@ def shares(items: Sequence[Item]) -> list[list[Item]]:
 def run_workers(
     python: Path, worker: Path, specs: Sequence[object], out: Path, on_progress: Callable[[str], None]
 ) -> None:
-    """Have Blender's Python run a script on each specification in JSON and a folder; each file's name as it is done.
+    """``run_worker`` on each specification, side by side; ``on_progress`` is called by one at a time.
 
-    The scripts run side by side, each on a core of its own: making a scene ready takes one however many there are.
-    Raises ``RuntimeError`` with the last words of one that fails.
+    Each has a core of its own: making a scene ready takes one however many there are.
     """
-    out.mkdir(parents=True, exist_ok=True)
     telling = Lock()
 
-    def run(spec: object) -> None:
-        with tempfile.TemporaryDirectory() as scratch:
-            told = Path(scratch) / "spec.json"
-            told.write_text(json.dumps(spec))
-            command = [str(python), str(worker), str(told), str(out)]
-            with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as running:
-                said: deque[str] = deque(maxlen=10)
-                for line in running.stdout or ():
-                    said.append(line)
-                    if line.startswith("rendered "):
-                        with telling:
-                            on_progress(line.split()[1])
-            if running.returncode:
-                raise RuntimeError(f"Blender failed: {''.join(said)}")
+    def tell(name: str) -> None:
+        with telling:
+            on_progress(name)
 
     with ThreadPoolExecutor(len(specs)) as pool:
-        for _ in pool.map(run, specs):
+        for _ in pool.map(lambda spec: run_worker(python, worker, spec, out, tell), specs):
             pass
+
+
+def run_worker(python: Path, worker: Path, spec: object, out: Path, on_progress: Callable[[str], None]) -> None:
+    """Have Blender's Python run a script on a specification in JSON and a folder; each file's name as it is done.
+
+    Raises ``RuntimeError`` with the script's last words if it fails.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as scratch:
+        told = Path(scratch) / "spec.json"
+        told.write_text(json.dumps(spec))
+        command = [str(python), str(worker), str(told), str(out)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as running:
+            said: deque[str] = deque(maxlen=10)
+            for line in running.stdout or ():
+                said.append(line)
+                if line.startswith("rendered "):
+                    on_progress(line.split()[1])
+        if running.returncode:
+            raise RuntimeError(f"Blender failed: {''.join(said)}")
 
 
 def sharp_edge(size_px: int) -> Map:
