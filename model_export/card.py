@@ -23,7 +23,9 @@ no blur to read; there the surroundings are continued and the stated error is la
 
 ## Trained on
 
-Procedural scenes only: layered surfaces refocused by an occlusion-aware renderer, {training.steps:,} steps.
+Drawn and rendered scenes only, no real photograph whose depth was measured: layered surfaces, rooms and views of
+furnished rooms, refocused by an occlusion-aware renderer. The last of its runs took {training.steps:,} steps; what weights
+it began with and what it learned from is in docs/training.md.
 Commit `{training.commit}`. Ranges, in pixels of the image that the graphs are given:
 
 | quantity | low | high |
@@ -34,7 +36,7 @@ Beyond them an answer is a guess and the service says so in its warnings.
 
 ## Licence and sources
 
-Weights: Apache-2.0. Textures of the scenes:
+Weights: Apache-2.0. Pictures that scenes were made of:
 
 {sources.strip() or "none but what the generator draws"}
 
