@@ -24,8 +24,8 @@ no blur to read; there the surroundings are continued and the stated error is la
 ## Trained on
 
 Drawn and rendered scenes only, no real photograph whose depth was measured: layered surfaces, rooms and views of
-furnished rooms, refocused by an occlusion-aware renderer. The last of its runs took {training.steps:,} steps; what weights
-it began with and what it learned from is in docs/training.md.
+furnished rooms, refocused by an occlusion-aware renderer. {training.steps:,} steps in the last of its runs;
+docs/training.md says what weights it began with and what it learned from.
 Commit `{training.commit}`. Ranges, in pixels of the image that the graphs are given:
 
 | quantity | low | high |

@@ -1,10 +1,13 @@
 """Who may do what: API keys in front of every request but those for health and the page, their scopes, and their quota.
 
+Where no key is asked for, whoever is at this machine may do all, and so could any page in their browser: it may not.
+
 A scope is asked for by path, before a route or a body is looked at; a path that is not named here takes any key.
 """
 
 import math
 import time
+from urllib.parse import urlsplit
 
 from fastapi.concurrency import run_in_threadpool
 from limits import RateLimitItemPerMinute
@@ -13,7 +16,7 @@ from limits.strategies import MovingWindowRateLimiter
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from service.errors import Forbidden, QuotaExceeded, Unauthorized
+from service.errors import CrossOrigin, Forbidden, QuotaExceeded, Unauthorized
 from service.principal import ANYBODY, Principal
 from service.principal import Scope as KeyScope
 from service.storage.keys import ApiKey, Keys
@@ -39,7 +42,7 @@ SCOPES_OF_READING: dict[tuple[str, str], KeyScope] = {("POST", "/cameras/preview
 class Authenticate:
     """Puts a ``Principal`` into the request's state: the key's owner, or ``ANYBODY`` where no key is asked for.
 
-    Raises ``Unauthorized``, ``Forbidden`` and ``QuotaExceeded``.
+    Raises ``Unauthorized``, ``Forbidden`` and ``QuotaExceeded``; without keys ``CrossOrigin``.
     """
 
     def __init__(self, app: ASGIApp, *, is_on: bool, requests_per_minute: int) -> None:
@@ -50,6 +53,8 @@ class Authenticate:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "http":
+            if not self._is_on and scope["method"] not in READING and is_from_another_site(Headers(scope=scope)):
+                raise CrossOrigin("A page of another site asked for this; only the service's own page may.")
             state = scope.setdefault("state", {})
             state["principal"] = await self._principal(scope) if self._is_on else ANYBODY
         await self._app(scope, receive, send)
@@ -78,6 +83,14 @@ class Authenticate:
             f"This API key has had its {self._quota.amount} requests of this minute.",
             retry_after_s=max(1, math.ceil(wait_s)),
         )
+
+
+def is_from_another_site(headers: Headers) -> bool:
+    """Whether a browser says that a page of another origin asks (W3C Fetch Metadata; ``Origin`` of older browsers)."""
+    site, origin = headers.get("sec-fetch-site"), headers.get("origin")
+    if site is not None:
+        return site in ("cross-site", "same-site")
+    return origin is not None and urlsplit(origin).netloc != headers.get("host")
 
 
 def is_public(path: str) -> bool:

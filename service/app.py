@@ -26,6 +26,7 @@ from service.api import (
     photographs,
     target,
 )
+from service.api.uploads import Arrivals
 from service.calibration.calibrate import calibrate
 from service.config import Settings
 from service.inference.artifact import load_model_folder
@@ -80,6 +81,7 @@ def create_app(settings: Settings, calibrate: Calibrate = calibrate) -> FastAPI:
     app.state.tracing = Tracing(settings.otlp_endpoint) if settings.otlp_endpoint else None
     app.state.calibrate = calibrate
     app.state.is_stopping = False
+    app.state.arrivals = Arrivals((settings.worker_slots + settings.queue_size) * settings.max_image_bytes)
     _add_middleware(app, settings)
     handlers.install(app)
     for part in (cameras, depth, photographs, calibrations, look, target, model, health, metrics, pages):

@@ -170,7 +170,9 @@ def calibrate(
     columns: Annotated[int, typer.Option(min=2, max=40)] = 4,
     spacing_mm: Annotated[float, typer.Option(help="The spacing s of the grid, as measured on the sheet")] = 20.0,
     diameter_mm: Annotated[float, typer.Option(help="Of each circle")] = 12.0,
-    focus_distance_m: Annotated[float | None, typer.Option(help="Where the lens is focused. [default: found]")] = None,
+    focus_distance_m: Annotated[
+        float | None, typer.Option(min=0.001, max=100_000, help="Where the lens is focused. [default: found]")
+    ] = None,
     method: Literal["edge", "paper"] = "edge",
     out: Annotated[Path, typer.Option(help="Report to write; its plot goes beside it", dir_okay=False)] = Path(
         "calibration.json"

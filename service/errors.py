@@ -7,6 +7,7 @@ CamindError
 │   └── KeyReused              an Idempotency-Key that came with another request
 ├── Unauthorized (401)         no API key, or none that is good
 ├── Forbidden (403)            the API key lacks a scope
+├── CrossOrigin (403)          another site's page asks for a change
 ├── NotFound (404)
 ├── MethodNotAllowed (405)     the path exists, the method does not
 ├── ReceiveTimeout (408)       the request came too slowly
@@ -96,6 +97,12 @@ class Forbidden(CamindError):
     @property
     def headers(self) -> dict[str, str]:
         return {"WWW-Authenticate": f'Bearer error="insufficient_scope", scope="{self.scope}"'}
+
+
+class CrossOrigin(CamindError):
+    status = 403
+    code = "cross-origin"
+    title = "Asked by another site's page"
 
 
 class NotFound(CamindError):

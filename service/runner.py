@@ -33,6 +33,7 @@ MOST_ATTEMPTS = 3
 LOOK_S = 5.0
 WRITE_S = 1.0
 RETRY_S = 1.0
+GIVE_UP_S = 3600.0  # between looks for what other processes left behind
 CLOSE_S = 10.0
 
 log = structlog.stdlib.get_logger("camind.calibration")
@@ -78,6 +79,7 @@ class Runner:
         self._limits = limits
         self._calibrate = calibrate
         self._is_ready = False
+        self._gave_up_s = -GIVE_UP_S
         self._wake = threading.Event()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="calibration", daemon=True)
@@ -118,6 +120,9 @@ class Runner:
         if not self._is_ready:
             self._calibrations.recover(self._spool.id)
             self._is_ready = True
+        if time.monotonic() - self._gave_up_s >= GIVE_UP_S:
+            self._calibrations.give_up(self._spool.id)
+            self._gave_up_s = time.monotonic()
         self._sweep()
         record = self._calibrations.take(self._spool.id)
         if record is None:

@@ -69,6 +69,32 @@ def operations(app: FastAPI) -> Iterator[tuple[str, str, list[str]]]:
             yield method.upper(), path, scopes
 
 
+@pytest.mark.parametrize(
+    ("headers", "is_refused"),
+    [
+        ({"Sec-Fetch-Site": "cross-site"}, True),
+        ({"Sec-Fetch-Site": "same-site", "Origin": "http://testserver:9"}, True),
+        ({"Origin": "http://elsewhere.example"}, True),
+        ({"Origin": "null"}, True),
+        ({"Sec-Fetch-Site": "same-origin", "Origin": "http://behind-a-proxy.example"}, False),
+        ({"Sec-Fetch-Site": "none"}, False),
+        ({"Origin": "http://testserver"}, False),
+        ({}, False),
+    ],
+)
+def test_without_keys_another_site_s_page_changes_nothing(
+    settings: Settings, headers: dict[str, str], is_refused: bool
+) -> None:
+    app = create_app(settings.model_copy(update={"api_keys": "off"}), FakeCalibration())
+    with TestClient(app) as client:
+        made = client.post("/cameras", json=CAMERA, headers=headers)
+        if is_refused:
+            refused(made, 403, "cross-origin")
+            assert client.get("/cameras", headers=headers).json()["items"] == []
+        else:
+            assert made.status_code == 201
+
+
 def test_every_path_but_health_and_the_page_asks_for_a_key(app: FastAPI, client: TestClient) -> None:
     asked = {(method, path.format(name="x", id="0" * 32)) for method, path, _ in operations(app)}
     others = {("GET", path) for path in ("/docs", "/openapi.json", "/webx", NOWHERE)}

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from service.api.cursors import NextCursor
 from service.api.problems import invalid_request
-from service.api.schemas import Given, Name, PinholeIntrinsics
+from service.api.schemas import Given, IntrinsicsRead, Name
 from service.calibration.edge import Shape
 from service.calibration.look import Exposure, Look
 from service.calibration.report import Method, Role
@@ -155,7 +155,7 @@ class ResultRead(BaseModel):
     gamma_px: IntervalRead
     focus_distance_m: Annotated[IntervalRead, Field(description="Of no width where it was given")]
     point_spread: Annotated[Shape, Field(description="The shape of defocus that fits the circles better")]
-    intrinsics: PinholeIntrinsics
+    intrinsics: IntrinsicsRead
     reprojection_rms_px: Annotated[float, Field(description="How well the circles' places fit the lens")]
     samples: list[SampleRead]
     curve: Annotated[list[CurvePointRead], Field(description="The fitted blur over the distances measured")]

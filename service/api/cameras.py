@@ -23,6 +23,7 @@ from service.api.schemas import (
 from service.api.uploads import REQUEST_BODY, receive_photograph
 from service.errors import (
     BadRequest,
+    Busy,
     Conflict,
     FieldProblem,
     InvalidImage,
@@ -99,7 +100,7 @@ def list_cameras(
     "/from-photo",
     operation_id="draftCamera",
     summary="Draft a camera from a photograph",
-    responses=responses(BadRequest, InvalidImage, TooLarge, UnsupportedKind),
+    responses=responses(BadRequest, InvalidImage, TooLarge, UnsupportedKind, Busy),
     openapi_extra={"requestBody": REQUEST_BODY},
 )
 async def draft_camera_from_photo(request: Request, settings: SettingsDep) -> CameraDraftRead:

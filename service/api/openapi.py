@@ -10,7 +10,7 @@ from fastapi.openapi.utils import get_openapi
 
 from service.access import is_public, needed_scope
 from service.api.problems import Problem, responses
-from service.errors import Forbidden, QuotaExceeded, ReceiveTimeout, TooLarge, Unauthorized
+from service.errors import CrossOrigin, Forbidden, QuotaExceeded, ReceiveTimeout, TooLarge, Unauthorized
 
 # words that YAML reads as truth values or nothing
 YAML_WORDS = frozenset({"null", "true", "false", "yes", "no", "on", "off", "y", "n"})
@@ -82,7 +82,7 @@ def _complete(operation: dict[str, Any]) -> None:
 def _secure(operation: dict[str, Any], scope: str | None) -> None:
     """Say that a key is asked for, or none (``{}``), which scope it needs, and what happens without."""
     operation["security"] = [{API_KEY: [scope] if scope else []}, {}]
-    for status, answer in responses(*KEY_ERRORS, *([Forbidden] if scope else [])).items():
+    for status, answer in responses(*KEY_ERRORS, *([Forbidden, CrossOrigin] if scope else [])).items():
         operation["responses"].setdefault(str(status), answer)
 
 

@@ -37,7 +37,10 @@ class LensSpecs(Given):
     pixel_pitch_um: Annotated[
         float, Field(ge=0.01, le=1_000, allow_inf_nan=False, description="Pitch of one sensor pixel")
     ]
-    sensor_width_px: Annotated[Pixels, Field(description="Width of the whole sensor in its own pixels")]
+    sensor_width_px: Annotated[
+        Pixels,
+        Field(description="The whole sensor along the images' width, in its own pixels: of tall images its short side"),
+    ]
     k_r: Annotated[
         float,
         Field(
@@ -69,6 +72,27 @@ class PinholeIntrinsics(Given):
         if len(self.distortion) not in DISTORTION_LENGTHS:
             raise _fault("#/intrinsics/distortion", "Send 0, 4, 5, 8, 12 or 14 coefficients, in OpenCV's order.")
         return Intrinsics(self.fx_px, self.fy_px, self.cx_px, self.cy_px, tuple(self.distortion))
+
+
+class IntrinsicsRead(BaseModel):
+    """Pinhole intrinsics as stored: a calibration may have found any."""
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    distortion: Annotated[list[float], Field(description="OpenCV's order")]
+
+    @classmethod
+    def from_domain(cls, intrinsics: Intrinsics) -> Self:
+        """The intrinsics as the physics has them."""
+        return cls(
+            fx_px=intrinsics.fx_px,
+            fy_px=intrinsics.fy_px,
+            cx_px=intrinsics.cx_px,
+            cy_px=intrinsics.cy_px,
+            distortion=list(intrinsics.distortion),
+        )
 
 
 class CameraSpecs(Given):
@@ -225,7 +249,7 @@ class CameraRead(BaseModel):
     ]
     source: Annotated[Source, Field(description="Where k_cam came from")]
     lens: LensSpecs | None
-    intrinsics: PinholeIntrinsics | None
+    intrinsics: IntrinsicsRead | None
     fx_px: Annotated[float | None, Field(description="From the intrinsics or the lens, else null")]
     range_m: RangeRead
     revision: Annotated[int, Field(description="Grows by one with every change; never used twice under one name")]
@@ -248,7 +272,7 @@ class CameraRead(BaseModel):
             k_r=draft.k_r,
             source=draft.source,
             lens=_lens_read(draft.lens),
-            intrinsics=_intrinsics_read(camera.intrinsics),
+            intrinsics=IntrinsicsRead.from_domain(camera.intrinsics) if camera.intrinsics else None,
             fx_px=_fx_px(draft),
             range_m=RangeRead(near=near, far=far),
             revision=record.revision,
@@ -336,16 +360,4 @@ def _lens_read(lens: Lens | None) -> LensSpecs | None:
         pixel_pitch_um=lens.pixel_pitch_um,
         sensor_width_px=lens.sensor_width_px,
         k_r=lens.k_r,
-    )
-
-
-def _intrinsics_read(intrinsics: Intrinsics | None) -> PinholeIntrinsics | None:
-    if intrinsics is None:
-        return None
-    return PinholeIntrinsics(
-        fx_px=intrinsics.fx_px,
-        fy_px=intrinsics.fy_px,
-        cx_px=intrinsics.cx_px,
-        cy_px=intrinsics.cy_px,
-        distortion=list(intrinsics.distortion),
     )

@@ -1,13 +1,14 @@
 """One photograph out of a request: the raw body, or a multipart field; never more bytes than allowed."""
 
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from fastapi import Request
 from starlette.datastructures import UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 
-from service.errors import BadRequest, FieldProblem, TooLarge
+from service.errors import BadRequest, Busy, FieldProblem, TooLarge
 from service.inference.images import MEDIA_TYPES, declared_kind
 
 FIELD = "image"
@@ -42,22 +43,52 @@ class Upload:
     media_type: str | None
 
 
+class Arrivals:
+    """What of photographs has come in and is not whole yet: the bytes of all together are bounded, as the queue is.
+
+    For the event loop alone.
+    """
+
+    def __init__(self, most_bytes: int) -> None:
+        self._most_bytes = most_bytes
+        self._held_bytes = 0
+
+    @contextmanager
+    def counted(self) -> Iterator[Callable[[int], None]]:
+        """What is given takes some more bytes, or raises ``Busy``; all are given back at the end."""
+        own_bytes = 0
+
+        def take(count: int) -> None:
+            nonlocal own_bytes
+            if self._held_bytes + count > self._most_bytes:
+                raise Busy("Too many photographs arrive at once: try again later.")
+            self._held_bytes += count
+            own_bytes += count
+
+        try:
+            yield take
+        finally:
+            self._held_bytes -= own_bytes
+
+
 async def receive_photograph(request: Request, max_bytes: int) -> Upload:
     """The photograph of a request.
 
-    Raises ``TooLarge``, ``UnsupportedKind`` (a declared type that is not listed) and ``BadRequest`` (a form
-    without the field, or with others).
+    Raises ``TooLarge``, ``UnsupportedKind`` (a declared type that is not listed), ``BadRequest`` (a form without the
+    field, or with others) and ``Busy`` (too much arrives at once).
     """
     media_type = request.headers.get("content-type")
-    if media_type is not None and media_type.lower().startswith(MULTIPART):
-        return await _from_form(request, max_bytes)
-    declared_kind(media_type)
-    chunks = [chunk async for chunk in _bounded(request, max_bytes)]
-    return Upload(b"".join(chunks), media_type)
+    arrivals: Arrivals = request.app.state.arrivals
+    with arrivals.counted() as take:
+        if media_type is not None and media_type.lower().startswith(MULTIPART):
+            return await _from_form(request, max_bytes, take)
+        declared_kind(media_type)
+        chunks = [chunk async for chunk in _bounded(request, max_bytes, take)]
+        return Upload(b"".join(chunks), media_type)
 
 
-async def _from_form(request: Request, max_bytes: int) -> Upload:
-    stream = _bounded(request, max_bytes + MULTIPART_OVERHEAD_BYTES)
+async def _from_form(request: Request, max_bytes: int, take: Callable[[int], None]) -> Upload:
+    stream = _bounded(request, max_bytes + MULTIPART_OVERHEAD_BYTES, take)
     parser = MultiPartParser(request.headers, stream, max_files=1, max_fields=1)
     # photographs for depth are never written to a disk, not even to an unnamed file
     parser.spool_max_size = max_bytes + MULTIPART_OVERHEAD_BYTES
@@ -76,8 +107,8 @@ async def _from_form(request: Request, max_bytes: int) -> Upload:
         await form.close()
 
 
-async def _bounded(request: Request, max_bytes: int) -> AsyncGenerator[bytes, None]:
-    """The body in chunks; ``TooLarge`` by its stated length before the first, by its true length after."""
+async def _bounded(request: Request, max_bytes: int, take: Callable[[int], None]) -> AsyncGenerator[bytes, None]:
+    """The body in chunks, each counted; ``TooLarge`` by its stated length before the first, by its true one after."""
     stated = request.headers.get("content-length", "")
     if stated.isdecimal() and int(stated) > max_bytes:
         raise _too_large(max_bytes)
@@ -86,6 +117,7 @@ async def _bounded(request: Request, max_bytes: int) -> AsyncGenerator[bytes, No
         received += len(chunk)
         if received > max_bytes:
             raise _too_large(max_bytes)
+        take(len(chunk))
         yield chunk
 
 

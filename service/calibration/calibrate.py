@@ -77,8 +77,9 @@ def calibrate(
     """Calibrate. ``tell(progress in 0..1, reports so far)`` is called about every second of work.
 
     ``check`` is called more often and may raise to stop the work; what it raises comes out. What is wrong with the
-    pictures is in the report, never raised.
+    pictures is in the report, never raised. Focused ones come first, there too: their partners need them.
     """
+    pictures = sorted(pictures, key=lambda picture: picture.role != "focused")
     teller = _Teller(tell, check)
     measured: list[Measured] = []
     with threadpool_limits(1, "blas"):  # the sums are small: more threads would wait for each other

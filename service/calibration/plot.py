@@ -68,7 +68,8 @@ def _spread(axes: Axes, result: Result) -> None:
             by_image.setdefault(sample.image, []).append(sample.k_cam_px)
     if by_image:
         names = [name if len(name) <= LONGEST_NAME else f"…{name[1 - LONGEST_NAME :]}" for name in by_image]
-        axes.boxplot(list(by_image.values()), tick_labels=names, flierprops={"markersize": 3})
+        plain = [name.replace("$", r"\$") for name in names]  # no formula, whatever a file is called
+        axes.boxplot(list(by_image.values()), tick_labels=plain, flierprops={"markersize": 3})
         axes.tick_params(axis="x", labelrotation=90, labelsize=7)
         middle = np.concatenate([np.asarray(values) for values in by_image.values()])
         low, high = np.quantile(middle, [0.02, 0.98])

@@ -1,5 +1,6 @@
 """Where the sheet was in every photograph, and the intrinsics that make it so: depth is z along the axis, not a ray."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,6 +21,7 @@ LITTLE_TILT_DEG = 8.0
 BAD_RMS_PART = 0.008  # of the spacing
 FREE_VIEWS, CLEARLY = 6, 0.75
 TELL_BENT_MM = 0.5
+MOST_FOCAL_ERROR = 0.1
 CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-10)
 
 
@@ -79,6 +81,12 @@ def place(grid: CircleGrid, views: Sequence[View], size_px: tuple[int, int]) -> 
     middle = board.mean(0)
     tilts = [_tilt_deg(turn) for turn in turns]
     matrix = solved.matrix
+    focal_error = _focal_error(board, views, solved)
+    if focal_error > MOST_FOCAL_ERROR:
+        raise PoseError(
+            f"the focal length cannot be told from these sheets, tilted by at most {max(tilts):.0f} degrees: tilt the "
+            "sheet by 15 to 25 degrees, this way and that"
+        )
     return Placement(
         Intrinsics(
             float(matrix[0, 0]),
@@ -92,7 +100,7 @@ def place(grid: CircleGrid, views: Sequence[View], size_px: tuple[int, int]) -> 
         tuple(tilts),
         tuple(solved.errors.tolist()),
         solved.rms,
-        solved.focal_error,
+        focal_error,
         (*_warnings(grid, views, solved, tilts), *_imperfect(bent_mm)),
     )
 
@@ -130,7 +138,6 @@ class _Solved:
     turns: tuple[Array, ...]
     shifts: tuple[Array, ...]
     errors: Array
-    focal_error: float
 
 
 def _freed(
@@ -189,7 +196,7 @@ def _solved(
     if len(views) < FEW_VIEWS or near is not None:
         flags |= cv2.CALIB_USE_INTRINSIC_GUESS
     try:
-        rms, matrix, distortion, turns, shifts, deviations, _, errors = cv2.calibrateCameraExtended(
+        rms, matrix, distortion, turns, shifts, _, _, errors = cv2.calibrateCameraExtended(
             [board[view.circles].astype(np.float32) for view in views],
             [np.asarray(places, np.float32)[:, None] for places in centres],
             size_px,
@@ -207,8 +214,36 @@ def _solved(
         tuple(np.asarray(turn, np.float64) for turn in turns),
         tuple(np.asarray(shift, np.float64) for shift in shifts),
         np.asarray(errors, np.float64).ravel(),
-        float(np.ravel(deviations)[:2].max() / matrix[0, 0]),
     )
+
+
+def _focal_error(board: Array, views: Sequence[View], solved: _Solved) -> float:
+    """The relative standard error of the focal length, all else that was fitted being free too.
+
+    OpenCV's own drops what the circles hardly tell, which of sheets that were never tilted is the focal length.
+    """
+    camera = 8 if len(views) >= FEW_VIEWS else 2  # what _solved lets free: the focal length alone, or all but k3
+    rows = []
+    for number, view in enumerate(views):
+        _, slopes = cv2.projectPoints(
+            board[view.circles], solved.turns[number], solved.shifts[number], solved.matrix, solved.distortion
+        )
+        slopes = np.asarray(slopes, np.float64)
+        row = np.zeros((len(slopes), 6 * len(views) + camera))
+        row[:, 6 * number : 6 * number + 6] = slopes[:, :6]
+        # the last is both focal lengths grown alike, by their logarithm
+        row[:, -1] = slopes[:, 6] * solved.matrix[0, 0] + slopes[:, 7] * solved.matrix[1, 1]
+        row[:, -2] = slopes[:, 10]
+        if camera > 2:
+            row[:, -8:-2] = slopes[:, [7, 8, 9, 11, 12, 13]]
+        rows.append(row)
+    jacobian = np.concatenate(rows)
+    freedom = len(jacobian) - jacobian.shape[1]
+    lengths = np.linalg.norm(jacobian, axis=0)
+    triangle = np.asarray(np.linalg.qr(jacobian / lengths, mode="r"))
+    told = float(abs(triangle[-1, -1]) * lengths[-1])
+    scatter_px = solved.rms * math.sqrt(len(jacobian) / 2 / freedom) if freedom > 0 else math.inf
+    return scatter_px / told if told > 0 else math.inf
 
 
 def _bias(board: Array, grid: CircleGrid, view: View, solved: _Solved, number: int) -> Array:

@@ -7,6 +7,7 @@ import io
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import tifffile
@@ -89,7 +90,9 @@ def encode_npy(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
 
 
 def encode_npz(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
-    """All maps by their names, and ``K`` float64 [3, 3], NaN where the intrinsics are unknown."""
+    """All maps by their names, ``K`` float64 [3, 3], NaN where the intrinsics are unknown, ``distortion`` if any."""
+    distortion = _distortion(answer)
+    more: dict[str, Any] = {"distortion": distortion} if distortion.any() else {}
     stream = io.BytesIO()
     np.savez(
         stream,
@@ -100,6 +103,7 @@ def encode_npz(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
         blur_px=answer.blur_px,
         valid=answer.valid,
         K=camera_matrix(answer),
+        **more,
     )
     return Encoded(stream.getvalue(), MEDIA_TYPES["npz"])
 
@@ -124,8 +128,7 @@ def encode_ply(answer: DepthMap, rgb: NDArray[np.uint8]) -> Encoded:
     points = np.empty(
         len(z), [(axis, "<f4") for axis in "xyz"] + [(colour, "u1") for colour in ("red", "green", "blue")]
     )
-    points["x"] = (u - matrix[0, 2]) / matrix[0, 0] * z
-    points["y"] = (v - matrix[1, 2]) / matrix[1, 1] * z
+    points["x"], points["y"] = _rays(answer, u, v) * z
     points["z"] = z
     points["red"], points["green"], points["blue"] = rgb[v, u].T
     return Encoded(_ply_header(len(z)) + points.tobytes(), MEDIA_TYPES["ply"])
@@ -166,6 +169,20 @@ def camera_matrix(answer: DepthMap) -> NDArray[np.float64]:
     known = answer.camera.intrinsics
     fx, fy, cx, cy = (known.fx_px, known.fy_px, known.cx_px, known.cy_px) if known else (math.nan,) * 4
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
+
+
+def _distortion(answer: DepthMap) -> NDArray[np.float64]:
+    """The lens' distortion in OpenCV's order; empty where there is none."""
+    return np.array(answer.camera.intrinsics.distortion if answer.camera.intrinsics else (), np.float64)
+
+
+def _rays(answer: DepthMap, u: NDArray[np.intp], v: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Where pixels look: x and y [2, n] at a depth of 1, without the lens' distortion."""
+    matrix, distortion = camera_matrix(answer), _distortion(answer)
+    if not distortion.any() or len(u) == 0:
+        return np.stack([(u - matrix[0, 2]) / matrix[0, 0], (v - matrix[1, 2]) / matrix[1, 1]])
+    places = np.stack([u, v], 1).astype(np.float64)[:, None]
+    return np.asarray(cv2.undistortPoints(places, matrix, distortion), np.float64)[:, 0].T
 
 
 def spread_of(answer: DepthMap) -> Spread:

@@ -1,6 +1,8 @@
 """A photograph and its camera to depth: chooses the scale, reads, decides. No answer depends on another."""
 
 import weakref
+from collections.abc import Iterator
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
@@ -93,11 +95,16 @@ class Estimator:
         if part is None:
             return self._estimate(rgb, camera, scale, side, cancellation)
         around = part.widened(round(SURROUNDINGS_PX / scale), self.manifest.multiple, width, height)
-        read = self._estimate(around.of(rgb), around.behind(camera), scale, side, cancellation)
-        return read.cut(part.within(around))
+        return self._estimate(around.of(rgb), around.behind(camera), scale, side, cancellation, part.within(around))
 
     def _estimate(
-        self, rgb: NDArray[np.uint8], camera: Camera, scale: float, side: Side, cancellation: Cancellation
+        self,
+        rgb: NDArray[np.uint8],
+        camera: Camera,
+        scale: float,
+        side: Side,
+        cancellation: Cancellation,
+        part: Part | None = None,
     ) -> DepthMap:
         height, width = rgb.shape[:2]
         stopwatch = Stopwatch()
@@ -120,15 +127,21 @@ class Estimator:
         cancellation.check()
         with stopwatch.stage("encode"):
             depth_m, valid = decide(reading, (height, width))
-        return DepthMap(
+        answer = DepthMap(
             depth_m=depth_m,
             valid=valid,
             layers=all_layers(reading, (height, width)),
             camera=camera,
             scales=tuple(scales),
-            warnings=(*self._warnings(reading, most_blur_px), *_sparseness(valid)),
+            warnings=(),
             timings_ms=stopwatch.elapsed_ms,
         )
+        blur_px = reading.blur_px
+        if part is not None:
+            answer, blur_px = answer.cut(part), part.cells_of(blur_px, (height, width))
+        blurrier = float((blur_px > most_blur_px / reading.scale).mean())
+        warnings = (*self._warnings(reading, whole=part is None), *_hardness(blurrier, answer.valid_fraction))
+        return replace(answer, warnings=warnings)
 
     def _base_scale(self, camera: Camera) -> float:
         """The largest copy whose k_cam the model reads well, or a smaller one of a large picture; never enlarged."""
@@ -157,18 +170,15 @@ class Estimator:
             pixel_budget=self._pixel_budget,
         )
 
-    def _warnings(self, reading: Reading, most_blur_px: float) -> list[str]:
+    def _warnings(self, reading: Reading, *, whole: bool) -> list[str]:
         camera, scale, ranges = reading.camera, reading.scale, self.manifest.ranges
-        size = f"{camera.image_width_px}x{camera.image_height_px}"
-        told = [] if scale == 1 else [f"read at {scale:.3g} of full size ({size})"]
+        size = f" ({camera.image_width_px}x{camera.image_height_px})" if whole else ""
+        told = [] if scale == 1 else [f"read at {scale:.3g} of full size{size}"]
         told += _outside("k_cam_px at that size", camera.k_cam_px, ranges.k_cam_px)
         told += _outside("gamma_px at that size", camera.gamma_px, ranges.gamma_px)
         told += _outside("focus_distance_m", camera.focus_distance_m, ranges.focus_distance_m)
         if camera.intrinsics:
             told += _outside("fx_px at that size", camera.intrinsics.fx_px, ranges.focal_length_px)
-        blurrier = float((reading.blur_px > most_blur_px / scale).mean())
-        if blurrier > BLURRED_FRACTION:
-            told.append(f"{blurrier:.0%} of the pixels show more blur than the model was trained on")
         return told
 
 
@@ -184,6 +194,8 @@ def _outside(name: str, value: float, trained: Interval) -> list[str]:
     return [f"{name} is {value:.4g}, outside {trained.low:g} to {trained.high:g} that the model was trained on"]
 
 
-def _sparseness(valid: NDArray[np.bool_]) -> list[str]:
-    fraction = float(valid.mean())
-    return [f"only {fraction:.0%} of the pixels have an answer"] if fraction < FEW_ANSWERS else []
+def _hardness(blurrier: float, answered: float) -> Iterator[str]:
+    if blurrier > BLURRED_FRACTION:
+        yield f"{blurrier:.0%} of the pixels show more blur than the model was trained on"
+    if answered < FEW_ANSWERS:
+        yield f"only {answered:.0%} of the pixels have an answer"

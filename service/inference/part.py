@@ -30,6 +30,14 @@ class Part:
         """The part of a picture or map [h, w, ...], as a view."""
         return pixels[self.top : self.bottom, self.left : self.right]
 
+    def cells_of(self, cells: NDArray[Any], size: tuple[int, int]) -> NDArray[Any]:
+        """What of cells [h, w] all over a photograph of that size (height, width) the part touches, as a view."""
+        (down, across), (height, width) = cells.shape[:2], size
+        return cells[
+            self.top * down // height : -(-self.bottom * down // height),
+            self.left * across // width : -(-self.right * across // width),
+        ]
+
     def behind(self, camera: Camera) -> Camera:
         """The camera of a photograph as the one behind this part of it."""
         return camera.cropped(self.left, self.top, self.width_px, self.height_px)

@@ -242,13 +242,19 @@ class Calibrations:
             return before
 
     def recover(self, spool: str) -> None:
-        """What the spool's last run left running is queued again; what other spools left behind long ago fails."""
+        """What the spool's last run left running is queued again."""
         now = datetime.now(UTC)
         again = (
             update(CalibrationRow)
             .where(col(CalibrationRow.spool) == spool, col(CalibrationRow.state) == "running")
             .values(state="queued", progress=0.0, images=[], version=CalibrationRow.version + 1, updated_at=now)
         )
+        with writing(self._engine) as session:
+            session.connection().execute(again)
+
+    def give_up(self, spool: str) -> None:
+        """What other spools left behind long ago fails."""
+        now = datetime.now(UTC)
         given_up = (
             update(CalibrationRow)
             .where(
@@ -264,7 +270,6 @@ class Calibrations:
             )
         )
         with writing(self._engine) as session:
-            session.connection().execute(again)
             session.connection().execute(given_up)
 
     def _add(self, draft: CalibrationDraft, once: Once | None) -> CalibrationRecord:

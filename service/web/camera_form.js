@@ -140,7 +140,7 @@ export function CameraForm({ editing, onSaved, onCancel }) {
             ${field("lens/focal_length_mm", "Focal length (mm)", { hint: "the real one, never the 35-mm equivalent" })}
             ${field("lens/f_number", "f-number")}
             ${field("lens/pixel_pitch_um", "Pixel pitch (µm)", { hint: "of one sensor pixel" })}
-            ${field("lens/sensor_width_px", "Sensor width (px)", { hint: "the whole sensor, in its own pixels" })}
+            ${field("lens/sensor_width_px", "Sensor width (px)", { hint: "of the whole sensor, along the image width" })}
           </div>`
         : html`<div class="pair">
             ${field("k_cam_px", "k_cam (px)", { hint: "blur per unit of relative defocus, at the image width" })}

@@ -45,6 +45,7 @@ const EITHER = [0.3, 0.7];
 const NOTHING = 0x80;
 const HATCH = 0xb4;
 const PATTERN_PX = 8;
+const UNDISTORT_ROUNDS = 5;
 
 export class DepthMaps {
   /** @param {Map<string, import("./npy.js").NumpyArray>} arrays */
@@ -63,6 +64,7 @@ export class DepthMaps {
     this.blurPx = take("blur_px");
     const [fx, , cx, , fy, cy] = take("K");
     this.lens = { fx, fy, cx, cy };
+    this.distortion = Array.from(arrays.get("distortion")?.data ?? []);
   }
 
   /** @param {Blob} npz */
@@ -151,7 +153,7 @@ export class DepthMaps {
    */
   ray(u, v) {
     const { fx, fy, cx, cy } = this.lens;
-    return [(u - cx) / fx, (v - cy) / fy, 1];
+    return [...undistorted((u - cx) / fx, (v - cy) / fy, this.distortion), 1];
   }
 
   /**
@@ -242,6 +244,28 @@ export class DepthMaps {
       spacing: step / this.lens.fx,
     };
   }
+}
+
+/**
+ * Where a pixel would look without the lens' distortion, by the fixed point that OpenCV iterates to.
+ *
+ * @param {number} x
+ * @param {number} y at a depth of 1, as if there were none
+ * @param {number[]} distortion in OpenCV's order
+ * @returns {[number, number]}
+ */
+function undistorted(x, y, distortion) {
+  if (distortion.every((term) => term === 0)) return [x, y];
+  const [k1 = 0, k2 = 0, p1 = 0, p2 = 0, k3 = 0, k4 = 0, k5 = 0, k6 = 0, s1 = 0, s2 = 0, s3 = 0, s4 = 0] = distortion;
+  let [a, b] = [x, y];
+  for (let round = 0; round < UNDISTORT_ROUNDS; round++) {
+    const r2 = a * a + b * b;
+    const shrunk = (1 + r2 * (k4 + r2 * (k5 + r2 * k6))) / (1 + r2 * (k1 + r2 * (k2 + r2 * k3)));
+    const across = 2 * p1 * a * b + p2 * (r2 + 2 * a * a) + r2 * (s1 + r2 * s2);
+    const down = p1 * (r2 + 2 * b * b) + 2 * p2 * a * b + r2 * (s3 + r2 * s4);
+    [a, b] = [(x - across) * shrunk, (y - down) * shrunk];
+  }
+  return [a, b];
 }
 
 /**

@@ -4,7 +4,42 @@ from typing import Any
 
 import pytest
 import structlog
+from fastapi import FastAPI
 from starlette.testclient import TestClient
+
+from service.api.uploads import Arrivals
+from service.errors import Busy
+from tests.inference.photographs import corners, png
+
+
+def test_what_arrives_all_together_is_bounded() -> None:
+    arrivals = Arrivals(100)
+    with arrivals.counted() as take:
+        take(60)
+        with arrivals.counted() as take_more:
+            take_more(40)
+            with pytest.raises(Busy, match="arrive at once"):
+                take(1)
+        take(40)
+        with pytest.raises(Busy):
+            take(1)
+    with arrivals.counted() as take:
+        take(100)
+
+
+@pytest.mark.parametrize("form", [False, True])
+def test_too_much_at_once_is_busy_and_is_forgotten(app: FastAPI, client: TestClient, form: bool) -> None:
+    body = png(corners())
+    sent: dict[str, Any] = {"files": {"image": ("a.png", body, "image/png")}} if form else {"content": body}
+    app.state.arrivals = Arrivals(len(body) // 2)
+    for _ in range(2):
+        answer = client.post("/photographs/preview", **sent)
+        assert answer.status_code == 503
+        assert answer.json()["type"] == "urn:camind:problem:busy"
+        assert answer.headers["retry-after"] == "1"
+    app.state.arrivals = Arrivals(2 * len(body) + 1000)
+    for _ in range(3):
+        assert client.post("/photographs/preview", **sent).status_code == 200
 
 
 @pytest.mark.parametrize("given", ["abc", "0f8b-4.2_1:x", "a" * 128])

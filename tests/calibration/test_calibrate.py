@@ -57,6 +57,8 @@ def test_the_plot_is_the_same_picture_every_time(report: Report) -> None:
     assert drawn.startswith(b"<?xml")
     assert b"k_cam picture by picture" in drawn
     assert as_svg(report.result) == drawn
+    samples = tuple(replace(sample, image="a$_{$.jpg") for sample in report.result.samples)
+    assert b"a$_{$.jpg" in as_svg(replace(report.result, samples=samples))
 
 
 def test_pairs_as_in_the_paper_by_both_methods() -> None:
@@ -70,6 +72,15 @@ def test_pairs_as_in_the_paper_by_both_methods() -> None:
     assert edge.k_cam_px.value == pytest.approx(4.0, rel=0.05)
     assert edge.focus_distance_m.low == edge.focus_distance_m.high == 0.5
     assert 1.25 < paper.k_cam_px.value / 4.0 < 1.6
+
+
+def test_a_partner_that_comes_later_serves_as_well() -> None:
+    sheet = (0.3,)
+    blurred = shots(replace(CAMERA, k_cam_px=45.0), sheet, seed=3)  # its circles run into each other
+    focused = shots(replace(CAMERA, k_cam_px=1e-3), sheet, "focused", seed=3)
+    partner, found = calibrate(Task(GRID), pictures([*blurred, *focused])).pictures
+    assert (partner.role, found.role) == ("focused", "defocused")
+    assert "looked for the circles where its focused partner has them" in found.warnings
 
 
 def test_a_portrait_among_landscapes_is_turned(taken: list[Shot]) -> None:

@@ -22,14 +22,16 @@ def flat() -> Array:
     return np.column_stack([GRID.points_mm(), np.zeros(GRID.rows * GRID.columns)])
 
 
-def views(sheet: Array, count: int = 8, *, noise_px: float = 0.03) -> tuple[list[View], list[Array]]:
+def views(
+    sheet: Array, count: int = 8, *, noise_px: float = 0.03, tilted: float = 1.0
+) -> tuple[list[View], list[Array]]:
     """The centres of the circles' outlines as photographs show them, and their true depths in metres."""
     rng = np.random.default_rng(0)
     angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(60)], 1) * GRID.diameter_mm / 2
     seen, depths = [], []
     for (a, b), depth_m in zip(TILTS[:count], DEPTHS_M[:count], strict=True):
-        turn = np.array([a, b, 1.5])
+        turn = np.array([tilted * a, tilted * b, 1.5])
         rotation = np.asarray(cv2.Rodrigues(turn)[0])
         shift = np.array([5.0, -8.0, 1e3 * depth_m]) - rotation @ sheet.mean(0)
         outlines, _ = cv2.projectPoints((sheet[:, None] + rim).reshape(-1, 3), turn, shift, MATRIX, DISTORTION)
@@ -78,6 +80,21 @@ def test_few_views_and_no_tilt_are_said_and_one_view_is_an_error() -> None:
     assert any("3 usable photographs" in warning for warning in place(GRID, seen, SIZE).warnings)
     with pytest.raises(PoseError, match="1 photograph shows"):
         place(GRID, seen[:1], SIZE)
+
+
+@pytest.mark.parametrize("tilted", [0.08, 0.15, 0.3])
+def test_the_less_the_sheet_is_tilted_the_larger_is_the_error_stated(tilted: float) -> None:
+    seen, depths = views(flat(), tilted=tilted)
+    found = place(GRID, seen, SIZE)
+    off = max(float(np.abs(got / true - 1).max()) for got, true in zip(found.depth_m, depths, strict=True))
+    assert off < 3 * found.focal_error
+    assert found.focal_error * tilted**2 == pytest.approx(2e-4, rel=0.2), "as the square of the tilt"
+
+
+def test_sheets_that_were_never_tilted_tell_no_focal_length() -> None:
+    seen, _ = views(flat(), tilted=0.0)
+    with pytest.raises(PoseError, match="tilt the sheet by 15 to 25 degrees"):
+        place(GRID, seen, SIZE)
 
 
 def test_two_cameras_mixed_are_said() -> None:

@@ -114,6 +114,26 @@ def test_ply_points_project_back_to_their_pixels(answer: DepthMap) -> None:
     np.testing.assert_array_equal(np.stack([points[c] for c in "rgb"], 1), RGB[v, u])
 
 
+def test_points_leave_the_lens_distortion_out(answer: DepthMap) -> None:
+    distortion = (-0.2, 0.05, 1e-3, -2e-3, 0.01)
+    bent = replace(answer, camera=replace(CAMERA, intrinsics=Intrinsics(50.0, 52.0, 19.5, 14.5, distortion)))
+    body = encode_ply(bent, RGB).body.partition(b"end_header\n")[2]
+    kinds = [(axis, "<f4") for axis in "xyz"] + [(colour, "u1") for colour in "rgb"]
+    points = np.frombuffer(body, np.dtype(kinds))
+    matrix = np.array([[50.0, 0, 19.5], [0, 52.0, 14.5], [0, 0, 1]])
+    places, _ = cv2.projectPoints(
+        np.stack([points[axis] for axis in "xyz"], 1).astype(np.float64),
+        np.zeros(3),
+        np.zeros(3),
+        matrix,
+        np.array(distortion),
+    )
+    v, u = np.nonzero(bent.valid)
+    np.testing.assert_allclose(np.asarray(places)[:, 0], np.stack([u, v], 1), atol=0.01)
+    with np.load(io.BytesIO(encode_npz(bent, RGB).body)) as stored:
+        np.testing.assert_array_equal(stored["distortion"], distortion)
+
+
 def test_preview_is_near_red_far_blue_and_grey_without_an_answer(answer: DepthMap) -> None:
     answer.depth_m[:8, :8] = np.nan
     pixels = cv2.imdecode(np.frombuffer(encode_preview(answer, RGB).body, np.uint8), cv2.IMREAD_COLOR_RGB)

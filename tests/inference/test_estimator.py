@@ -316,6 +316,21 @@ def test_a_part_is_read_with_its_surroundings_and_no_more(folder: Path, monkeypa
     assert 30 + 2 * SURROUNDINGS_PX <= height < 30 + 2 * SURROUNDINGS_PX + 16
 
 
+def test_a_part_is_warned_of_for_itself(tmp_path: Path) -> None:
+    folder = build_oracle_pair(tmp_path / "model", blur_range=Interval(0.3, 5.0))
+    thirds = np.hstack([grey(brightness_for(4.0), 64, 48), grey(brightness_for(6.0), 64, 96)])
+    camera = replace(CAMERA, image_width_px=144)
+    estimator = Estimator.from_folder(load_model_folder(folder))
+    blurred, sparse = "67% of the pixels show more blur than the model was trained on", "only 33% of the pixels"
+    told = " / ".join(estimator.estimate(thirds, camera, "near").warnings)
+    assert blurred in told
+    assert sparse in told
+    assert not estimator.estimate(thirds, camera, "near", part=Part(4, 8, 36, 40)).warnings
+    told = " / ".join(estimator.estimate(thirds, camera, "near", part=Part(80, 8, 120, 40)).warnings)
+    assert "100% of the pixels show more blur" in told
+    assert "only 0% of the pixels" in told
+
+
 def test_a_camera_of_another_size_is_refused(estimator: Estimator) -> None:
     with pytest.raises(ValueError, match="64x96"):
         estimator.estimate(grey(60, 96, 64), CAMERA)

@@ -155,12 +155,12 @@ def test_what_a_dead_process_left_is_tried_again(calibrations: Calibrations) -> 
 
 def test_what_a_lost_service_held_fails_after_a_day(calibrations: Calibrations, engine: Engine) -> None:
     ids = [calibrations.add(draft()).id, running_elsewhere(calibrations).id]
-    calibrations.recover("c" * 32)
+    calibrations.give_up("c" * 32)
     assert [calibrations.get(each).state for each in ids] == ["queued", "running"]
     with writing(engine) as session:
         yesterday = datetime.now(UTC) - timedelta(days=1, minutes=1)
         session.connection().execute(update(CalibrationRow).values(updated_at=yesterday))
-    calibrations.recover("c" * 32)
+    calibrations.give_up("c" * 32)
     for each in ids:
         read = calibrations.get(each)
         assert read.state == "failed"

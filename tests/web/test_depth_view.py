@@ -200,6 +200,27 @@ def test_two_points_have_the_distance_that_their_pixels_say(measured: Page, maps
     expect(measured.locator("[data-value=distance]")).to_have_count(0)
 
 
+def test_the_distance_leaves_the_lens_distortion_out(page: Page, served: Server, d200: dict[str, Any]) -> None:
+    matrix = np.array([[950.0, 0, 322], [0, 950, 215.5], [0, 0, 1]])
+    distortion = [-0.25, 0.1, 2e-3, -1e-3, 0.02]
+    lens = {"fx_px": 950, "fy_px": 950, "cx_px": 322, "cy_px": 215.5, "distortion": distortion}
+    served.add({**d200, "name": "barrel", "intrinsics": lens})
+    page.goto("")
+    choose(page, "barrel")
+    give(page)
+    picture = stage(page)
+    reply = served.ask("POST", "/depth?camera=barrel&format=npz", PHOTOGRAPH.read_bytes())
+    known = np.load(io.BytesIO(reply.body))
+    np.testing.assert_array_equal(known["distortion"], distortion)
+    ends = ((40, 400), (560, 90))
+    for u, v in ends:
+        picture.click(position=place_of(picture, u, v))
+    seen = cv2.undistortPoints(np.array(ends, np.float64)[:, None], matrix, np.array(distortion))[:, 0]
+    points = [np.array([*ray, 1]) * known["depth_m"][v, u] for ray, (u, v) in zip(seen, ends, strict=True)]
+    expect(page.locator("[data-value=distance]")).to_be_visible()
+    assert number_in(page, "distance") == pytest.approx(np.linalg.norm(points[0] - points[1]), abs=0.001)
+
+
 def test_keys_alone_read_and_measure(measured: Page, maps: Callable[..., Any]) -> None:
     picture, known = stage(measured), maps()
     picture.focus()
