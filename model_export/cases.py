@@ -135,7 +135,7 @@ def viewed_cases(folder: Path, count: int, view: float) -> Iterator[Case]:
         size = (round(width / shrink), round(height / shrink))
         how = cv2.INTER_CUBIC if view < 1 else cv2.INTER_AREA
         picture = cv2.resize(_encoded(photo)[cut], size, interpolation=how)
-        depth = np.asarray(cv2.resize(photo.depth_m[cut], size, interpolation=cv2.INTER_NEAREST), np.float32)
+        depth = np.asarray(cv2.resize(photo.depth_m[cut], size, interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
         camera = replace(REFERENCE, image_width_px=size[0], image_height_px=size[1])
         camera = replace(camera, intrinsics=Intrinsics.centred(FRAME_FX_PX / view, *size))
         blurred = refocus(np.clip(np.asarray(picture, np.float32), 0, 1), filled(depth), camera)

@@ -22,9 +22,8 @@ from service.inference.cancellation import Cancellation
 from service.inference.depth_map import DepthMap
 from service.inference.estimator import Estimator
 from service.inference.hypotheses import SIGMA_OF_LAPLACE
-from service.inference.pair import GraphPair, RawMaps, Stopwatch
+from service.inference.pair import GraphPair, RawMaps
 from service.optics import thin_lens
-from service.optics.camera import Camera
 
 # an unknown camera is taken for the middle one of those that are scored
 UNKNOWN_K_CAM_PX = math.prod(UNSEEN_K_CAM_PX) ** (1 / len(UNSEEN_K_CAM_PX))
@@ -280,7 +279,8 @@ class _RememberingPair(GraphPair):
             if len(self._seen) == REMEMBERED:
                 self._seen.pop(next(iter(self._seen)))
             self._seen[picture] = super().see(rgb, cancellation)
-        return self._seen[picture]
+        # what is read of a smaller copy is written over these
+        return {name: seen.copy() for name, seen in self._seen[picture].items()}
 
 
 class Examiner:
@@ -290,7 +290,6 @@ class Examiner:
         folder = load_model_folder(model)
         self._pair = _RememberingPair(folder, intra_op_threads=1)
         self._estimator = Estimator(self._pair)
-        self._stride = folder.manifest.stride
 
     def answer(self, case: Case, mode: str = "gt") -> tuple[Outcome, Example]:
         """Run a case through the estimator, with the camera as the mode tells it, and score the answer."""
@@ -310,20 +309,25 @@ class Examiner:
             depth=Pixels(truth[some], depth[some], stated[some]),
             depth_blur_px=thin_lens.blur_from_defocus(defocus * case.camera.k_cam_px, case.camera.gamma_px),
             depth_defocus=defocus,
-            blur=self._blur(case, camera) if mode == "gt" else None,
+            blur=self._blur(case) if mode == "gt" else None,
             sides=_sides(case, told) if case.side == "auto" else None,
         )
         return outcome, Example(case.image, case.truth_m, told.depth_m, told.sigma_m)
 
-    def _blur(self, case: Case, camera: Camera) -> Pixels | None:
-        """Lambda where the case knows it, at the cells of the blur graph, read at full size."""
+    def _blur(self, case: Case) -> Pixels | None:
+        """Lambda where the case knows it, at the middles of the cells of what a request would read."""
         if case.blur_px is None:
             return None
-        maps = self._pair.read(case.image, camera, case.side, Cancellation(), Stopwatch())
-        truth = case.blur_px[:: self._stride, :: self._stride]
+        read = self._estimator.read(case.image, case.camera, case.side)
+        answer = read.maps["blur_px"] * (case.camera.image_width_px / read.camera.image_width_px)
+        rows, columns = (
+            ((np.arange(cells) + 0.5) * size / cells).astype(int)
+            for cells, size in zip(answer.shape, case.blur_px.shape, strict=True)
+        )
+        truth = case.blur_px[np.ix_(rows, columns)]
         known = np.isfinite(truth)
-        stated = np.exp(maps["blur_log_error"]) * SIGMA_OF_LAPLACE
-        return Pixels(truth[known], maps["blur_px"][known], stated[known])
+        stated = np.exp(read.maps["blur_log_error"]) * SIGMA_OF_LAPLACE
+        return Pixels(truth[known], answer[known], stated[known])
 
 
 def _sides(case: Case, told: DepthMap) -> Sides:

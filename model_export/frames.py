@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_export.datasets.photos import filled, load_photos
+from service.optics import thin_lens
 from service.optics.light import decode_srgb
 
 SIZES = (0.65, 1.0)  # of the frame's own size
@@ -36,16 +37,22 @@ def load_frames(folder: Path) -> list[Frame]:
     ]
 
 
-def draw_view(rng: np.random.Generator, frame: Frame, size: int) -> tuple[Map, Map, float]:
-    """A part of the frame, mirrored where it ends: linear light [size,size,3], depth [size,size] m, focal length px."""
+def draw_view(rng: np.random.Generator, frame: Frame, size: int) -> tuple[Map, Map, float, float]:
+    """A part of the frame, mirrored where it ends: linear light [size,size,3], depth [size,size] m, focal length px.
+
+    The last is the variance (px^2) of the blur it has beside its pixels' box, for having been made small.
+    """
     grow = math.exp(rng.uniform(math.log(SIZES[0]), math.log(SIZES[1])))
     height, width = (round(grow * side) for side in frame.image.shape[:2])
     image = cv2.resize(frame.image, (width, height), interpolation=cv2.INTER_AREA)
-    depth_m = cv2.resize(frame.depth_m.astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST)
+    # of the others, INTER_NEAREST takes the upper left pixel of an area and not its middle one
+    depth_m = cv2.resize(frame.depth_m.astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
     rows, columns = (_window(rng, side, size) for side in (height, width))
     light = decode_srgb(np.asarray(image, np.float32)[rows][:, columns] / np.float32(255))
     light = (light ** rng.uniform(*CONTRASTS)) * rng.uniform(*TINTS, 3).astype(np.float32)
-    return light.astype(np.float32), np.asarray(depth_m, np.float32)[rows][:, columns], grow * frame.focal_length_px
+    depth = np.asarray(depth_m, np.float32)[rows][:, columns]
+    softness = thin_lens.averaging_variance(frame.image.shape[1], width)
+    return light.astype(np.float32), depth, grow * frame.focal_length_px, softness
 
 
 def _window(rng: np.random.Generator, side: int, size: int) -> NDArray[np.intp]:

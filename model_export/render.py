@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from model_export.datasets.photos import filled
 from service.optics import thin_lens
 from service.optics.camera import Camera
 from service.optics.light import decode_srgb, encode_srgb
@@ -219,9 +220,9 @@ def sliced(linear: NDArray[np.float32], defocus_px: NDArray[np.float32]) -> tupl
     index = _slices(defocus_px, SLICES_PER_LEVEL)
     layers = []
     for number in range(int(index.max()) + 1):
-        own = defocus_px[index == number]
         color, alpha = _slice(linear, index, number)
-        layers.append(Layer(color, alpha, torch.from_numpy(np.clip(defocus_px, own.min(), own.max()))))
+        own = filled(np.where(index == number, defocus_px, np.float32(np.nan)))
+        layers.append(Layer(color, alpha, torch.from_numpy(own)))
     return layers, index
 
 

@@ -32,7 +32,7 @@ Map = NDArray[np.float32]
 
 DEPTH_HEAD = [
     *("set", "camera", "pictures", "answered", "AbsRel", "constant", "certain half", "order"),
-    *("pooled RMSE", "constant", "median error"),
+    *("pooled RMSE", "constant", "median depth off by"),
 ]
 CERTAINTY_HEAD = [
     *("set", "camera", "within sigma", "within 2 sigma", *(f"surest {share:.0%}" for share in KEPT_SHARES)),

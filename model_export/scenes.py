@@ -7,6 +7,7 @@ sigma = k_cam |q - 1|; q > 1 is nearer than focus, q < 1 beyond.
 import math
 from dataclasses import dataclass, field, replace
 from statistics import NormalDist
+from typing import Self
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from model_export.config import SceneConfig
+from model_export.datasets.photos import filled
 from model_export.frames import Frame, draw_view
 from model_export.render import Layer, PointSpread, blur, render_layers, sliced
 from model_export.rooms import Surface, draw_room
@@ -42,6 +44,7 @@ SHOT_NOISE, READ_NOISE = (1e-6, 2e-3), (1e-4, 4e-3)
 GRAINY_SHARE, GRAIN = 0.25, (3e-4, 3e-3)  # dim light: grain must not pass for sharpness
 MOSTLY = 0.98
 PLAIN_SHARE = 0.35  # not compressed: the network must not need the noise of JPEG
+SHARPENED_SHARE = 0.3
 RESCALED_SHARE = 0.15
 RESCALES = (1.2, 1.6)
 Map = NDArray[np.float32]
@@ -258,7 +261,22 @@ def _through_mosaic(linear: Map) -> Map:
     return np.asarray(cv2.demosaicing(mosaic, cv2.COLOR_BayerBG2RGB), np.float32) / np.float32(32767.5)
 
 
-def develop(rng: np.random.Generator, linear: Map, config: SceneConfig, *, through_mosaic: bool) -> NDArray[np.uint8]:
+@dataclass(frozen=True, slots=True)
+class Sharpening:
+    """An unsharp mask: how much is added of what a Gaussian of this spread takes away; mostly nothing."""
+
+    amount: float = 0.0
+    spread_px: float = 1.0
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator) -> Self:
+        amount, spread_px = rng.uniform(0.1, 0.5), rng.uniform(0.7, 1.5)
+        return cls(amount, spread_px) if rng.random() < SHARPENED_SHARE else cls()
+
+
+def develop(
+    rng: np.random.Generator, linear: Map, config: SceneConfig, sharpening: Sharpening, *, through_mosaic: bool
+) -> NDArray[np.uint8]:
     """Light on the sensor [h,w,3] to a JPEG's pixels: exposure, noise, demosaic, white balance, tone, sharpening."""
     picture = linear * rng.uniform(0.5, 1.4) / max(float(np.quantile(linear, 0.98)), 0.2)
     shot_noise = _log_uniform(rng, GRAIN if rng.random() < GRAINY_SHARE else SHOT_NOISE)
@@ -278,9 +296,9 @@ def develop(rng: np.random.Generator, linear: Map, config: SceneConfig, *, throu
     encoded = encode_srgb(picture.astype(np.float32))
     bend = rng.uniform(-0.1, 0.35)
     encoded = encoded + bend * (encoded**2 * (3 - 2 * encoded) - encoded)
-    if rng.random() < 0.3:
-        soft = cv2.GaussianBlur(encoded, (0, 0), rng.uniform(0.7, 1.5))
-        encoded = encoded + rng.uniform(0.1, 0.5) * (encoded - soft)
+    if sharpening.amount > 0:
+        soft = cv2.GaussianBlur(encoded, (0, 0), sharpening.spread_px)
+        encoded = encoded + sharpening.amount * (encoded - soft)
     pixels = (np.clip(encoded, 0, 1) * 255 + 0.5).astype(np.uint8)
     if rng.random() < PLAIN_SHARE:
         return pixels
@@ -291,22 +309,27 @@ def develop(rng: np.random.Generator, linear: Map, config: SceneConfig, *, throu
 
 def _frame_layers(
     rng: np.random.Generator, shot: Shot, config: SceneConfig, frame: Frame
-) -> tuple[Shot, list[Layer], Map]:
+) -> tuple[Shot, list[Layer], Map, float]:
     """A frame before the shot's lens, which is focused so that one of its pixels is as far out of focus as may be.
 
-    Distances stay as they are. Where the blur would be more than the config allows, so is the shot's k_cam.
+    Distances stay as they are. Where the blur would be more than the config allows, so is the shot's k_cam. The last is
+    the variance of the blur that the frame has itself.
     """
     size = config.size_px + 2 * config.margin_px
-    light, depth_m, focal_length_px = draw_view(rng, frame, size)
+    light, depth_m, focal_length_px, softness = draw_view(rng, frame, size)
     anchor_m = float(depth_m[tuple(rng.integers(config.margin_px, size - config.margin_px, 2))])
     focus_m = float(np.clip(anchor_m * (1 + _draw_excess(rng, shot, config)), *config.focus_distance_m))
     excess = np.float32(focus_m) / depth_m - 1
     most = float(np.quantile(np.abs(excess), MOSTLY))
     k_cam_px = max(config.k_cam_px[0], min(shot.k_cam_px, config.defocus_px[1] / max(most, 1e-6)))
     layers, index = sliced(light, -excess * np.float32(k_cam_px))
-    shot = replace(shot, k_cam_px=k_cam_px, focus_distance_m=focus_m, focal_length_px=focal_length_px, side=0)
-    found = [np.where(index == n, excess, excess[index == n].mean()) for n in range(len(layers))]
-    return shot, layers, np.stack(found).astype(np.float32)
+    # no camera's picture of it is sharper than it is itself
+    gamma_px = max(shot.gamma_px, math.sqrt(thin_lens.PIXEL_BOX_VARIANCE + softness))
+    shot = replace(
+        shot, k_cam_px=k_cam_px, gamma_px=gamma_px, focus_distance_m=focus_m, focal_length_px=focal_length_px, side=0
+    )
+    found = [filled(np.where(index == n, excess, np.float32(np.nan))) for n in range(len(layers))]
+    return shot, layers, np.stack(found), softness
 
 
 def draw_sample(seed: int, config: SceneConfig, material: Material = NOTHING) -> Sample:
@@ -314,10 +337,9 @@ def draw_sample(seed: int, config: SceneConfig, material: Material = NOTHING) ->
     rng = np.random.default_rng(seed)
     shot = draw_shot(rng, config)
     if material.frames and rng.random() < config.frame_share:
-        shot, layers, excesses = _frame_layers(
-            rng, shot, config, material.frames[int(rng.integers(len(material.frames)))]
-        )
-        return Sample(*_photograph(rng, shot, config, layers, excesses), shot)
+        frame = material.frames[int(rng.integers(len(material.frames)))]
+        shot, layers, excesses, softness = _frame_layers(rng, shot, config, frame)
+        return Sample(*_photograph(rng, shot, config, layers, excesses, softness), shot)
     if rng.random() >= RESCALED_SHARE:
         return Sample(*_photograph(rng, shot, config, *draw_layers(rng, shot, config, material.photographs)), shot)
     size = config.size_px
@@ -333,28 +355,40 @@ def draw_sample(seed: int, config: SceneConfig, material: Material = NOTHING) ->
     taken = replace(
         shot,
         k_cam_px=shot.k_cam_px * ratio,
-        gamma_px=thin_lens.gamma_after_averaging(shot.gamma_px, ratio),
+        gamma_px=thin_lens.gamma_before_averaging(shot.gamma_px, larger_px, size),
         focal_length_px=shot.focal_length_px * ratio,
     )
     image, excess = _photograph(rng, taken, larger, *draw_layers(rng, taken, larger, material.photographs))
     small = cv2.resize(image.transpose(1, 2, 0), (size, size), interpolation=cv2.INTER_AREA)
-    told = cv2.resize(excess.astype(np.float32), (size, size), interpolation=cv2.INTER_NEAREST)
+    told = cv2.resize(excess.astype(np.float32), (size, size), interpolation=cv2.INTER_NEAREST_EXACT)
     pixels = np.ascontiguousarray(np.asarray(small, np.uint8).transpose(2, 0, 1))
-    return Sample(pixels, np.asarray(told, np.float16), shot)
+    gamma_px = thin_lens.gamma_after_averaging(taken.gamma_px, larger_px, size)
+    return Sample(pixels, np.asarray(told, np.float16), replace(shot, gamma_px=gamma_px))
 
 
 def _photograph(
-    rng: np.random.Generator, shot: Shot, config: SceneConfig, layers: list[Layer], excesses: Map
+    rng: np.random.Generator,
+    shot: Shot,
+    config: SceneConfig,
+    layers: list[Layer],
+    excesses: Map,
+    softness: float = 0.0,
 ) -> tuple[NDArray[np.uint8], NDArray[np.float16]]:
-    """Picture uint8 [3,h,w] and q - 1 [h,w] of surfaces, nearest first, taken so."""
+    """Picture uint8 [3,h,w] and q - 1 [h,w] of surfaces, nearest first, taken so.
+
+    gamma is what the picture shows in the end: what the surfaces have of it (``softness``, a variance in px^2), their
+    mosaic adds and a sharpening takes away is made up for by the lens.
+    """
     linear, front = render_layers(layers, shot.spread)
     seen = np.take_along_axis(excesses, front.numpy()[None], 0)[0]
-    variance = shot.gamma_px**2 - thin_lens.PIXEL_BOX_VARIANCE
+    sharpening = Sharpening.draw(rng)
+    before_px = thin_lens.blur_before_sharpening(shot.gamma_px, sharpening.amount, sharpening.spread_px)
+    variance = before_px**2 - thin_lens.PIXEL_BOX_VARIANCE - softness
     through_mosaic = variance > MOSAIC_VARIANCE and rng.random() < MOSAIC_SHARE
     rest = math.sqrt(max(variance - through_mosaic * MOSAIC_VARIANCE, 0.0))
     inner = slice(config.margin_px, config.margin_px + config.size_px)
     light = np.ascontiguousarray(blur(linear, rest)[:, inner, inner].permute(1, 2, 0).numpy())
-    pixels = develop(rng, light, config, through_mosaic=through_mosaic)
+    pixels = develop(rng, light, config, sharpening, through_mosaic=through_mosaic)
     return np.ascontiguousarray(pixels.transpose(2, 0, 1)), seen[inner, inner].astype(np.float16)
 
 

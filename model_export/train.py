@@ -41,6 +41,7 @@ TURNED_SHARE = 0.3  # most are left upright: below is nearer, as in most photogr
 # a camera known by its specs has a guess for gamma: mostly too low a one, since motion, haze and filters add softness
 GUESSED_GAMMA_SHARE, GUESSED_GAMMA = 0.6, (-0.2, 0.35)  # mean and standard deviation of the guess's log error
 HELD_OUT_SEED = 2**40
+CELL = 2  # pixels of a network's cell that one is taken of
 
 
 class SceneStream(Dataset[Sample]):
@@ -122,7 +123,9 @@ def collate(samples: list[Sample], rng: np.random.Generator) -> Batch:
         turns = int(rng.integers(4)) if rng.random() < TURNED_SHARE else 0
         flip = int(rng.choice([-1, 1]))
         images.append(np.rot90(sample.image, turns, (1, 2))[:, :, ::flip].copy())
-        excesses.append(np.rot90(sample.excess, turns)[:, ::flip].astype(np.float32))
+        # any pixel of a network's cell may be its truth: always the first would move all answers by half a pixel
+        cell = tuple(-rng.integers(0, CELL, 2))
+        excesses.append(np.roll(np.rot90(sample.excess, turns)[:, ::flip], cell, (0, 1)).astype(np.float32))
         shot = sample.shot
         focal = 0.0 if rng.random() < FOCAL_UNKNOWN_SHARE else shot.focal_length_px
         side = (shot.side or int(rng.choice([-1, 1]))) if rng.random() < SIDE_HINT_SHARE else 0

@@ -2,7 +2,7 @@
 
 import weakref
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -39,6 +39,19 @@ FEW_ANSWERS = 0.5
 SMALL_PX = 600_000
 KEPT_S = 10.0
 WARM_UP_PX = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Read:
+    """The networks' maps, of the copy that this camera's pictures are as large as.
+
+    Copies of ``widths_px`` were read; blur above ``most_blur_px``, in pixels of the first, is beyond the model.
+    """
+
+    maps: RawMaps
+    camera: Camera
+    widths_px: tuple[int, ...]
+    most_blur_px: float
 
 
 class Estimator:
@@ -97,6 +110,10 @@ class Estimator:
         around = part.widened(round(SURROUNDINGS_PX / scale), self.manifest.multiple, width, height)
         return self._estimate(around.of(rgb), around.behind(camera), scale, side, cancellation, part.within(around))
 
+    def read(self, rgb: NDArray[np.uint8], camera: Camera, side: Side = "auto") -> Read:
+        """What the networks answer, before it is decided what that means: for measuring them."""
+        return self._read_copies(rgb, _copied(camera, self._base_scale(camera)), side, Cancellation(), Stopwatch())
+
     def _estimate(
         self,
         rgb: NDArray[np.uint8],
@@ -108,20 +125,8 @@ class Estimator:
     ) -> DepthMap:
         height, width = rgb.shape[:2]
         stopwatch = Stopwatch()
-        working = _copied(camera, scale)
-        maps = self._read(rgb, working, side, cancellation, stopwatch)
-        scales, most_blur_px = [working.image_width_px / width], self.manifest.ranges.blur_px.high
-        if self._shows_strong_blur(maps, working):
-            coarser = _copied(working, COARSER)
-            ratio = Ratio.between(
-                (working.image_height_px, working.image_width_px), (coarser.image_height_px, coarser.image_width_px), 1
-            )
-            told = self._read(rgb, coarser, side, cancellation, stopwatch)
-            with stopwatch.stage("correct"):
-                blend(maps, told, ratio, self._strong_px)
-            scales.append(coarser.image_width_px / width)
-            most_blur_px /= COARSER
-        reading = Reading.of(maps, working, (height, width), self.manifest, side, most_blur_px)
+        read = self._read_copies(rgb, _copied(camera, scale), side, cancellation, stopwatch)
+        reading = Reading.of(read.maps, read.camera, (height, width), self.manifest, side, read.most_blur_px)
         if height * width > SMALL_PX:
             self._freeing.ask()  # what a large picture has taken is kept for the next one, but for a while only
         cancellation.check()
@@ -132,14 +137,14 @@ class Estimator:
             valid=valid,
             layers=all_layers(reading, (height, width)),
             camera=camera,
-            scales=tuple(scales),
+            scales=tuple(size / width for size in read.widths_px),
             warnings=(),
             timings_ms=stopwatch.elapsed_ms,
         )
         blur_px = reading.blur_px
         if part is not None:
             answer, blur_px = answer.cut(part), part.cells_of(blur_px, (height, width))
-        blurrier = float((blur_px > most_blur_px / reading.scale).mean())
+        blurrier = float((blur_px > read.most_blur_px / reading.scale).mean())
         warnings = (*self._warnings(reading, whole=part is None), *_hardness(blurrier, answer.valid_fraction))
         return replace(answer, warnings=warnings)
 
@@ -155,6 +160,23 @@ class Estimator:
         if camera.k_cam_px * COARSER < ranges.k_cam_px.low:
             return False
         return float((maps["blur_px"] > self._strong_px).mean()) > STRONG_FRACTION
+
+    def _read_copies(
+        self, rgb: NDArray[np.uint8], working: Camera, side: Side, cancellation: Cancellation, stopwatch: Stopwatch
+    ) -> Read:
+        """What a copy shows that is as large as that camera's pictures, and for strong blur one of half its size."""
+        maps = self._read(rgb, working, side, cancellation, stopwatch)
+        most_blur_px = self.manifest.ranges.blur_px.high
+        if not self._shows_strong_blur(maps, working):
+            return Read(maps, working, (working.image_width_px,), most_blur_px)
+        coarser = _copied(working, COARSER)
+        ratio = Ratio.between(
+            (working.image_height_px, working.image_width_px), (coarser.image_height_px, coarser.image_width_px), 1
+        )
+        told = self._read(rgb, coarser, side, cancellation, stopwatch)
+        with stopwatch.stage("correct"):
+            blend(maps, told, ratio, self._strong_px)
+        return Read(maps, working, (working.image_width_px, coarser.image_width_px), most_blur_px / COARSER)
 
     def _read(
         self, rgb: NDArray[np.uint8], working: Camera, side: Side, cancellation: Cancellation, stopwatch: Stopwatch

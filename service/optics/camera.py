@@ -145,7 +145,7 @@ class Camera:
         """The camera behind a copy made smaller by averaging areas, whose gamma has a pixel's box again."""
         if (width_px, height_px) == (self.image_width_px, self.image_height_px):
             return self
-        gamma_px = thin_lens.gamma_after_averaging(self.gamma_px, width_px / self.image_width_px)
+        gamma_px = thin_lens.gamma_after_averaging(self.gamma_px, self.image_width_px, width_px)
         return replace(self.resized(width_px, height_px), gamma_px=gamma_px)
 
     def cropped(self, left_px: int, top_px: int, width_px: int, height_px: int) -> "Camera":

@@ -1,10 +1,12 @@
 """The thin lens: distance to blur and back.
 
 Everything here is written with ``+ - * / **`` and ``abs`` only, so one function serves a float, a NumPy
-array and a torch tensor alike, element by element, and gradients flow through it. No array library is
-imported. Symbols, units and signs are those of ``docs/conventions.md``; "eq." numbers are the paper's.
+array and a torch tensor alike, element by element, and gradients flow through it; what takes a ``float`` is for
+numbers alone. No array library is imported. Symbols, units and signs are those of ``docs/conventions.md``; "eq."
+numbers are the paper's.
 """
 
+import math
 from typing import Any, Protocol, TypeVar
 
 
@@ -69,13 +71,40 @@ def blur_from_defocus(defocus_px: Q, gamma_px: Q | float) -> Q:
     return blur
 
 
-def gamma_after_averaging(gamma_px: float, ratio: float) -> float:
-    """gamma in pixels of the copy ``ratio`` times as large, where the smaller of both averages areas of the larger.
+def averaging_variance(from_px: int, to_px: int) -> float:
+    """What averaging areas, a side of ``from_px`` to ``to_px``, adds to blur's variance, in px^2 of the smaller copy.
+
+    Its own pixel's box is not in it. A pixel that an area's border cuts counts in both areas: a sixth of the larger
+    picture's px^2 on average over the places of borders, nothing where all borders lie between pixels.
+    """
+    places = to_px // math.gcd(from_px, to_px)
+    return (1 - 1 / places**2) / 6 * (to_px / from_px) ** 2
+
+
+def gamma_after_averaging(gamma_px: float, from_px: int, to_px: int) -> float:
+    """gamma in pixels of a copy that averages areas, ``to_px`` wide of ``from_px``.
 
     gamma contains a pixel's box, which is a pixel wide in either; the rest of it scales.
     """
-    rest = max(gamma_px**2 - PIXEL_BOX_VARIANCE, 0.0)
-    return float((rest * ratio**2 + PIXEL_BOX_VARIANCE) ** 0.5)
+    rest = max(gamma_px**2 - PIXEL_BOX_VARIANCE, 0.0) * (to_px / from_px) ** 2
+    return math.sqrt(rest + averaging_variance(from_px, to_px) + PIXEL_BOX_VARIANCE)
+
+
+def gamma_before_averaging(gamma_px: float, from_px: int, to_px: int) -> float:
+    """gamma of the picture whose copy has ``gamma_px``; that of a pixel's box alone where none is so sharp."""
+    rest = gamma_px**2 - averaging_variance(from_px, to_px) - PIXEL_BOX_VARIANCE
+    return math.sqrt(max(rest, 0.0) * (from_px / to_px) ** 2 + PIXEL_BOX_VARIANCE)
+
+
+def blur_before_sharpening(blur_px: float, amount: float, spread_px: float) -> float:
+    """lambda that looks like ``blur_px`` after an unsharp mask, which adds ``amount`` of what a Gaussian takes away.
+
+    By the slope of an edge in its middle, which is 1 / lambda but for a factor: (1 + a) / l - a / sqrt(l^2 + s^2).
+    """
+    before = blur_px
+    for _ in range(20):
+        before = (1 + amount) / (1 / blur_px + amount / math.hypot(before, spread_px))
+    return before
 
 
 def blur_at_depth(depth_m: Q, focus_distance_m: Q | float, k_cam_px: Q | float, gamma_px: Q | float) -> Q:

@@ -14,7 +14,7 @@ from model_export.cases import REFERENCE, Case, d200_cases, procedural_cases, sh
 from model_export.cli import commands
 from model_export.evaluate import EQUAL_BLUR_PX, Examiner, Pixels, Relief, Sides, blur_ranges, summarise
 from model_export.temperature import STRANGER, calibrate, temperature
-from service.inference.artifact import load_model_folder
+from service.inference.artifact import Interval, load_model_folder
 from service.optics import thin_lens
 from service.optics.camera import Camera
 from tests.inference.oracle_pair import LOG_DEPTH_SCALE, RELATIVE_BLUR_ERROR, blur_of, build_oracle_pair
@@ -84,6 +84,17 @@ def test_certainty_and_blur_are_scored_where_they_are_known(oracle: Examiner) ->
     assert outcome.blur.stated == pytest.approx(RELATIVE_BLUR_ERROR * 2**0.5, rel=1e-3)
     (found,) = (row for row in blur_ranges("grey", outcome.blur) if row.low_px == 2.0)
     assert found.bias == found.median == found.certain_median == pytest.approx(0.25, rel=1e-3)
+
+
+def test_what_a_smaller_copy_shows_is_not_remembered_of_the_larger_one(tmp_path: Path) -> None:
+    folder = build_oracle_pair(tmp_path / "model", blur_range=Interval(0.3, 10.0))
+    known = replace(case(1.0), blur_px=np.ones((64, 96), np.float32))
+    examiner = Examiner(folder)
+    first, again = (examiner.answer(known)[0] for _ in range(2))
+    assert first.blur is not None
+    assert again.blur is not None
+    np.testing.assert_array_equal(first.blur.answer, again.blur.answer)
+    np.testing.assert_array_equal(first.depth.answer, again.depth.answer)
 
 
 def test_the_certain_half_is_that_of_the_least_stated_error() -> None:

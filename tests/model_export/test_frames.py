@@ -26,7 +26,7 @@ def test_a_view_shows_what_it_says_the_depth_of(size: int) -> None:
     shown = np.where(frame().depth_m > 2, 200, 20).astype(np.uint8)
     dark_left = replace(frame(), image=shown[..., None].repeat(3, 2))
     for seed in range(20):
-        light, depth_m, focal_length_px = draw_view(np.random.default_rng(seed), dark_left, size)
+        light, depth_m, focal_length_px, _ = draw_view(np.random.default_rng(seed), dark_left, size)
         assert light.shape == (size, size, 3)
         assert 0.65 * 130 <= focal_length_px <= 130
         dark = light[..., 1] < light[..., 1].max() / 4 if np.ptp(depth_m) > 0 else depth_m < 2

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from model_export import scenes
 from model_export.config import SceneConfig
-from model_export.scenes import develop, draw_sample, draw_shot, true_blur_px
+from model_export.scenes import Sharpening, develop, draw_sample, draw_shot, true_blur_px
 
 CONFIG = SceneConfig(size_px=64, margin_px=24)
 SEEDS = range(30)
@@ -57,8 +57,8 @@ def test_noise_is_left_out_or_alike_in_all_colours_where_it_is_asked_for(seed: i
     grey = np.full((32, 32, 3), 0.2, np.float32)
 
     def deviations(config: SceneConfig) -> NDArray[np.float64]:
-        pixels = develop(np.random.default_rng(seed), grey, config, through_mosaic=False).astype(np.float64)
-        return np.asarray(pixels - pixels.mean((0, 1)))
+        pixels = develop(np.random.default_rng(seed), grey, config, Sharpening(), through_mosaic=False)
+        return np.asarray(pixels - pixels.mean((0, 1)), np.float64)
 
     plain = replace(CONFIG, jpeg_quality=(100, 100))
     assert deviations(replace(plain, clean_share=1.0)) == pytest.approx(0, abs=0.01)

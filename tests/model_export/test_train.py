@@ -243,6 +243,14 @@ def test_several_teachers_answer_as_their_mean() -> None:
     assert not torch.equal(one.near_logit, other.near_logit)
 
 
+def test_any_pixel_of_a_cell_is_its_truth_at_times() -> None:
+    names = np.arange(64 * 64, dtype=np.float16).reshape(64, 64) % 2 + 2 * (np.arange(64)[:, None] % 2)
+    sample = replace(draw_sample(0, SceneConfig(size_px=64, margin_px=24)), excess=names.astype(np.float16))
+    cells = [collate([sample], np.random.default_rng(seed)).excess[0, 0, ::2, ::2] for seed in range(40)]
+    assert all(cell.min() == cell.max() for cell in cells)
+    assert {float(cell[0, 0]) for cell in cells} == {0.0, 1.0, 2.0, 3.0}
+
+
 def test_the_learning_rate_warms_up_holds_and_falls_to_nothing() -> None:
     config = TrainConfig(steps=1000, warmup_steps=100)
     assert learning_rate(config, 0) < learning_rate(config, 50) < learning_rate(config, 100)

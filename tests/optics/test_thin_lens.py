@@ -1,5 +1,6 @@
 """The physics: round trips, limits, gradients, and one answer from float, NumPy and torch."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -8,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from service.optics import thin_lens
 
@@ -129,3 +131,38 @@ def test_gradient_at_focus_is_finite_with_a_floor() -> None:
     torch.autograd.backward(thin_lens.defocus_from_blur(blur, 0.5, floor_px=0.05).sum())
     assert blur.grad is not None
     assert torch.isfinite(blur.grad).all()
+
+
+@pytest.mark.parametrize(("from_px", "to_px"), [(320, 200), (480, 320), (640, 512), (300, 100), (336, 320), (645, 323)])
+def test_averaging_areas_adds_the_variance_it_says(from_px: int, to_px: int) -> None:
+    """The second moment of what each pixel of the larger picture becomes, its own box with it."""
+    ratio = to_px / from_px
+    edges = np.arange(from_px + 1) * ratio
+    cells = np.arange(to_px)
+    shares = np.clip(np.minimum(edges[1:, None], cells + 1) - np.maximum(edges[:-1, None], cells), 0, None) / ratio
+    middles = (edges[1:] + edges[:-1]) / 2
+    moment = (shares * (cells + 0.5 - middles[:, None]) ** 2).sum(1).mean() + ratio**2 * thin_lens.PIXEL_BOX_VARIANCE
+    added = moment - thin_lens.PIXEL_BOX_VARIANCE
+    assert thin_lens.averaging_variance(from_px, to_px) == pytest.approx(added, abs=2e-3)
+
+
+@pytest.mark.parametrize("gamma_px", [0.6, 1.2])
+def test_gamma_before_averaging_is_that_of_which_it_comes(gamma_px: float) -> None:
+    before = thin_lens.gamma_before_averaging(gamma_px, 300, 200)
+    assert thin_lens.gamma_after_averaging(before, 300, 200) == pytest.approx(gamma_px, rel=1e-9)
+
+
+@pytest.mark.parametrize("blur_px", [0.5, 1.0, 4.0])
+def test_an_edge_is_as_steep_after_sharpening_as_one_of_the_blur_asked_for(blur_px: float) -> None:
+    amount, spread_px = 0.4, 1.2
+    before_px = thin_lens.blur_before_sharpening(blur_px, amount, spread_px)
+    assert before_px > blur_px
+    x = np.linspace(-40, 40, 160_001)
+
+    def edge(sigma: float) -> NDArray[np.float64]:
+        shares = np.exp(-((x / sigma) ** 2) / 2)
+        return np.asarray(np.cumsum(shares) / shares.sum())
+
+    sharpened = (1 + amount) * edge(before_px) - amount * edge(math.hypot(before_px, spread_px))
+    assert np.gradient(sharpened, x).max() == pytest.approx(np.gradient(edge(blur_px), x).max(), rel=1e-3)
+    assert thin_lens.blur_before_sharpening(blur_px, 0.0, spread_px) == pytest.approx(blur_px)
