@@ -50,7 +50,13 @@ function go(tab, { camera } = {}) {
 function useHash() {
   const [place, setPlace] = useState(readHash);
   useEffect(() => {
-    const read = () => setPlace(readHash());
+    const read = () => {
+      const found = readHash();
+      setPlace(found);
+      // it is brought once: on the way back it would take the place of what was chosen or typed since
+      if (found.camera) history.replaceState(null, "", `#${found.tab}`);
+    };
+    read();
     addEventListener("hashchange", read);
     return () => removeEventListener("hashchange", read);
   }, []);
@@ -78,6 +84,16 @@ function App() {
   }, []);
   useEffect(() => {
     reloadCameras();
+  }, []);
+  useEffect(() => {
+    // what misses its place must not be opened instead of the page, which would be lost
+    const keep = (/** @type {DragEvent} */ event) => {
+      if (event.dataTransfer?.types.includes("Files")) event.preventDefault();
+    };
+    for (const kind of /** @type {const} */ (["dragover", "drop"])) document.addEventListener(kind, keep);
+    return () => {
+      for (const kind of /** @type {const} */ (["dragover", "drop"])) document.removeEventListener(kind, keep);
+    };
   }, []);
   useEffect(() => {
     function onKeyChanged() {

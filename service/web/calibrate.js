@@ -29,6 +29,7 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
   const [job, setJob] = useState(/** @type {any | null} */ (null));
   const [recent, setRecent] = useState(/** @type {any[]} */ ([]));
   const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
+  const [attempt, setAttempt] = useState(0);
   const [sent, setSent] = useState(/** @type {number | null | undefined} */ (undefined));
   const title = useRef(/** @type {HTMLHeadingElement | null} */ (null));
   const hasMoved = useRef(false);
@@ -40,9 +41,9 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
   const query = isMeasured(sheet) ? String(about) : "";
 
   useLooks(photos, setPhotos, query);
-  useJob(job, setJob, setProblem, (done) => {
+  useJob(job, attempt, setJob, setProblem, (done) => {
     announce(`The calibration ${done.state === "cancelled" ? "is" : "has"} ${done.state}.`);
-    move(3);
+    setStep((now) => (now === 2 ? 3 : now)); // who has gone elsewhere is left there
     if (done.camera_revision !== null) reloadCameras();
   });
 
@@ -84,6 +85,7 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
       setJob(found);
       move(FINAL.has(found.state) ? 3 : 2);
       setProblem(null);
+      setAttempt((count) => count + 1);
     } catch (error) {
       setProblem(problemOf(error));
     }
@@ -198,7 +200,7 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
         }}
         onAgain=${() => move(1)}
       />`}
-      ${step !== 1 && html`<${ProblemBox} problem=${problem} />`}
+      ${step !== 1 && html`<${ProblemBox} problem=${problem} onRetry=${step === 2 && job ? () => open(job.id) : undefined} />`}
       <${Recent} items=${recent} open=${job?.id ?? null} onOpen=${open} />
       <datalist id="camera-names">${(cameras ?? []).map((one) => html`<option value=${one.name}></option>`)}</datalist>
     </div>
@@ -239,11 +241,12 @@ function Recent({ items, open, onOpen }) {
  * Follows a calibration until it has ended; a stream that breaks is opened again.
  *
  * @param {any | null} job
+ * @param {number} attempt another one begins anew
  * @param {(job: any) => void} setJob
  * @param {(problem: Problem | null) => void} setProblem
  * @param {(job: any) => void} onEnd
  */
-function useJob(job, setJob, setProblem, onEnd) {
+function useJob(job, attempt, setJob, setProblem, onEnd) {
   const live = job !== null && !FINAL.has(job.state) ? job.id : null;
   useEffect(() => {
     if (live === null) return undefined;
@@ -268,7 +271,7 @@ function useJob(job, setJob, setProblem, onEnd) {
           if (stop.signal.aborted) return;
           const problem = problemOf(error);
           setProblem(problem);
-          if ([403, 404].includes(problem.status)) return;
+          if ([401, 403, 404].includes(problem.status)) return;
           waitMs = 1000 * (problem.retryAfterS ?? 1);
         }
         await new Promise((resolve) => setTimeout(resolve, waitMs));
@@ -276,7 +279,7 @@ function useJob(job, setJob, setProblem, onEnd) {
     };
     follow();
     return () => stop.abort();
-  }, [live]);
+  }, [live, attempt]);
 }
 
 /** @param {string} text @returns {number | null | undefined} null for none, undefined for what is no distance */

@@ -2,7 +2,7 @@
 
 import { Problem, getJson, problemOf, sendJson, storeCamera } from "./api.js";
 import { CameraCurve } from "./camera_curve.js";
-import { BLANK, bodyOf, differences, fieldsOf, missingOf } from "./camera_specs.js";
+import { BLANK, bodyOf, differences, fieldsOf, filledIn, missingOf } from "./camera_specs.js";
 import { PHOTOGRAPHS, mediaTypeOf } from "./photograph_files.js";
 import { ProblemBox } from "./problem_box.js";
 import { Table } from "./table.js";
@@ -70,7 +70,7 @@ export function CameraForm({ editing, onSaved, onCancel }) {
       const headers = { "Content-Type": mediaTypeOf(file) };
       const draft = await getJson("cameras/from-photo", { method: "POST", headers, body: file });
       setTold(draft.warnings);
-      setFields((before) => ({ ...before, ...fieldsOf({ ...draft, name: before.name || draft.name }), by: "lens" }));
+      setFields((before) => filledIn(before, draft));
       setProblem(null);
     } catch (error) {
       setProblem(problemOf(error));

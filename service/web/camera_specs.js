@@ -4,6 +4,7 @@ import { decimal } from "./numbers.js";
 
 /** @typedef {Record<string, string>} Fields by the pointer's path: "lens/f_number" */
 
+const SIZE = ["image_width_px", "image_height_px"];
 const LENS = ["focal_length_mm", "f_number", "pixel_pitch_um", "sensor_width_px", "k_r"];
 const PINHOLE = ["fx_px", "fy_px", "cx_px", "cy_px"];
 const NEEDED = {
@@ -52,6 +53,22 @@ export function fieldsOf(camera) {
     fill("intrinsics/distortion", (camera.intrinsics.distortion ?? []).join(", "));
   }
   return fields;
+}
+
+/**
+ * The fields with what a photograph tells. It tells neither gamma nor k_r, which may have been measured, and of intrinsics
+ * not the ones of another picture size.
+ *
+ * @param {Fields} before
+ * @param {any} draft
+ * @returns {Fields}
+ */
+export function filledIn(before, draft) {
+  const told = fieldsOf({ ...draft, name: before.name || draft.name });
+  const isAnotherSize = SIZE.some((name) => before[name] && before[name] !== told[name]);
+  const kept = Object.entries(before).filter(([path]) => !(isAnotherSize && path.startsWith("intrinsics/")));
+  const { gamma_px, "lens/k_r": k_r } = { ...BLANK, ...before };
+  return { ...Object.fromEntries(kept), ...told, gamma_px, "lens/k_r": k_r, by: "lens" };
 }
 
 /**

@@ -22,6 +22,8 @@ import { html, useCallback, useEffect, useMemo, useRef, useState } from "./vendo
 
 /**
  * @typedef {object} Result
+ * @property {{camera: string, side: string, focusM: number | null}} asked
+ * @property {File} file
  * @property {Facts} facts
  * @property {Blob} npz
  * @property {string[]} warnings
@@ -58,6 +60,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
   const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
   const [result, setResult] = useState(/** @type {Result | null} */ (null));
   const [look, setLook] = useState(FIRST_LOOK);
+  const [isOpening, setIsOpening] = useState(false);
   const [reading, setReading] = useState(/** @type {Reading | null} */ (null));
   const [marks, setMarks] = useState(/** @type {Pixel[]} */ ([]));
   const [picture, setPicture] = useState("photograph");
@@ -79,6 +82,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
     setReading(null);
     setMarks([]);
     setPhotograph(null);
+    setIsOpening(true);
     setIsDrafting(false);
     setFile(taken);
     newest.current = taken;
@@ -87,7 +91,9 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
     const found = await readShown(taken, mostPx, async (shown) =>
       isNewest() ? reader.ask("photograph", { file: shown, mostPx }).catch(() => null) : null,
     );
-    if (isNewest()) setPhotograph(found);
+    if (!isNewest()) return;
+    setPhotograph(found);
+    setIsOpening(false);
   }, []);
 
   useFilesFromOutside(shown, take);
@@ -142,6 +148,8 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
       const { spread } = facts;
       if (spread) setLook((before) => ({ ...before, nearM: spread.nearM, farM: spread.farM }));
       setResult({
+        asked: ask,
+        file: sent,
         facts,
         npz: answer.body,
         warnings: (answer.headers.get("Camind-Warnings") ?? "").split("; ").filter(Boolean),
@@ -244,7 +252,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
       <${Progress} phase=${phase} onCancel=${cancel} />
 
       ${size === null
-        ? html`<${DropPlace} file=${file} />`
+        ? html`<${DropPlace} file=${file} isOpening=${isOpening} />`
         : html`<div class=${`depth-grid ${phase && result ? "depth-stale" : ""}`}>
             <div class="stack">
               ${result &&
@@ -286,7 +294,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
               <${Readout} reading=${reading} />
               <${Distance} ...${{ marks, measured }} hasPoints=${result.facts.hasPoints} onClear=${() => setMarks([])} />
               <${Colours} look=${look} facts=${result.facts} onLook=${setLook} />
-              <${Exports} ...${{ ask, file, announce }} mediaType=${mediaTypeOf(/** @type {File} */ (file))} npz=${result.npz} />
+              <${Exports} key=${result.model + JSON.stringify(result.asked)} result=${result} announce=${announce} />
               <${Timings} timings=${result.timings} model=${result.model} />
             </div>`}
           </div>`}
@@ -303,9 +311,6 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 function useFilesFromOutside(shown, take) {
   useEffect(() => {
     if (!shown) return undefined;
-    const over = (/** @type {DragEvent} */ event) => {
-      if (event.dataTransfer?.types.includes("Files")) event.preventDefault();
-    };
     const drop = (/** @type {DragEvent} */ event) => {
       if (!event.dataTransfer?.files.length) return;
       event.preventDefault();
@@ -314,19 +319,17 @@ function useFilesFromOutside(shown, take) {
     const paste = (/** @type {ClipboardEvent} */ event) => {
       take(Array.from(event.clipboardData?.files ?? []).find((file) => file.type.startsWith("image/")));
     };
-    document.addEventListener("dragover", over);
     document.addEventListener("drop", drop);
     document.addEventListener("paste", paste);
     return () => {
-      document.removeEventListener("dragover", over);
       document.removeEventListener("drop", drop);
       document.removeEventListener("paste", paste);
     };
   }, [shown]);
 }
 
-/** @param {{file: File | null}} props */
-function DropPlace({ file }) {
+/** @param {{file: File | null, isOpening: boolean}} props */
+function DropPlace({ file, isOpening }) {
   const [isOver, setIsOver] = useState(false);
   return html`<div
     class=${isOver ? "drop over depth-drop" : "drop depth-drop"}
@@ -337,7 +340,9 @@ function DropPlace({ file }) {
     <p><strong>${file ? file.name : "Drop a photograph here, or paste one"}</strong></p>
     <p class="hint">
       ${file
-        ? "This browser cannot show it; the service may still read it."
+        ? isOpening
+          ? "Opening it ..."
+          : "This browser cannot show it; the service may still read it."
         : "The whole frame as the camera stored it: a crop has lost its scale. It is read, and not kept."}
     </p>
   </div>`;
@@ -371,7 +376,7 @@ function FocusField({ camera, onFocusM }) {
       min="0.001"
       step="any"
       inputmode="decimal"
-      placeholder=${camera ? `${camera.focus_distance_m}, the camera's` : "the camera's"}
+      placeholder=${camera ? `${short(camera.focus_distance_m, 4)}, the camera's` : "the camera's"}
       aria-invalid=${isWrong}
       onChange=${(/** @type {any} */ event) => {
         const { value, validity } = event.target;
@@ -461,7 +466,7 @@ function placeOfWarning(text) {
 /** @param {any} camera */
 function about({ image_width_px, image_height_px, focus_distance_m, range_m, description }) {
   const range = `reads up to ${short(range_m.far, 2)} m well`;
-  const numbers = `${image_width_px} × ${image_height_px} px, focused at ${focus_distance_m} m, ${range}`;
+  const numbers = `${image_width_px} × ${image_height_px} px, focused at ${short(focus_distance_m, 4)} m, ${range}`;
   return description ? `${description}. ${numbers}` : numbers;
 }
 

@@ -2,25 +2,19 @@
 
 import { Problem, getBlob, problemOf, storedKey } from "./api.js";
 import { FORMATS, answerName, curlCommand, depthPath, pythonCommand } from "./commands.js";
+import { mediaTypeOf } from "./photograph_files.js";
 import { ProblemBox } from "./problem_box.js";
 import { save } from "./save.js";
 import { html, useState } from "./vendor/preact.js";
 
-/**
- * @param {{
- *   ask: {camera: string, side: string, focusM: number | null},
- *   file: File,
- *   mediaType: string,
- *   npz: Blob,
- *   announce: (text: string) => void,
- * }} props
- */
-export function Exports({ ask, file, mediaType, npz, announce }) {
+/** @param {{result: import("./depth.js").Result, announce: (text: string) => void}} props */
+export function Exports({ result: { asked, file, npz }, announce }) {
   const [format, setFormat] = useState("png");
   const [isBusy, setIsBusy] = useState(false);
   const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
   const [copied, setCopied] = useState(/** @type {{text: string, isCopied: boolean} | null} */ (null));
-  const path = depthPath({ ...ask, format });
+  const path = depthPath({ ...asked, format });
+  const mediaType = mediaTypeOf(file);
   const answer = answerName(file.name, format);
 
   async function download() {

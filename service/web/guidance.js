@@ -7,6 +7,7 @@ import { short } from "./numbers.js";
  * @property {"focused" | "defocused"} role
  * @property {number} width before EXIF orientation
  * @property {number} height
+ * @property {number} orientation of EXIF
  * @property {{u_px: number, v_px: number}[]} circles
  * @property {number | null} blur in px
  * @property {number | null} distance in metres
@@ -27,7 +28,21 @@ const NEARER = [0.6, 0.8];
 const FARTHER = [1.25, 1.7];
 
 /**
- * How many circles were in each part of the frame.
+ * A place of the stored frame in the upright photograph.
+ *
+ * @param {number} x
+ * @param {number} y
+ * @param {number} orientation of EXIF
+ * @param {number} width of the stored frame
+ * @param {number} height
+ */
+export function upright(x, y, orientation, width, height) {
+  const [left, up] = [width - x, height - y];
+  return /** @type {[number, number][]} */ ([[x, y], [left, y], [left, up], [x, up], [y, x], [up, x], [up, left], [y, left]])[orientation - 1];
+}
+
+/**
+ * How many circles were in each part of the frame, which is shown as the newest photograph is held.
  *
  * @param {Seen[]} seen
  * @returns {number[][]} rows of columns
@@ -39,7 +54,17 @@ export function coverageOf(seen) {
   for (const { circles, width, height } of seen) {
     for (const { u_px: u, v_px: v } of circles) cells[place(v, height, ROWS)][place(u, width, COLUMNS)] += 1;
   }
-  return cells;
+  const orientation = seen[seen.length - 1]?.orientation ?? 1;
+  if (orientation === 1) return cells;
+  const [rows, columns] = orientation > 4 ? [COLUMNS, ROWS] : [ROWS, COLUMNS];
+  const shown = Array.from({ length: rows }, () => Array(columns).fill(0));
+  cells.forEach((row, down) =>
+    row.forEach((count, across) => {
+      const [x, y] = upright(across + 0.5, down + 0.5, orientation, COLUMNS, ROWS);
+      shown[Math.floor(y)][Math.floor(x)] = count;
+    }),
+  );
+  return shown;
 }
 
 /**
@@ -112,12 +137,12 @@ function sizeOf({ circles, width }) {
  * @returns {string | null} the first corner without a circle
  */
 function missingCorner(cells) {
-  const [top, bottom] = [cells[0], cells[ROWS - 1]];
+  const [top, bottom, last] = [cells[0], cells[cells.length - 1], cells[0].length - 1];
   const corners = /** @type {[string, number[], number[]][]} */ ([
     ["upper left corner", top, [0, 1]],
-    ["upper right corner", top, [COLUMNS - 2, COLUMNS - 1]],
+    ["upper right corner", top, [last - 1, last]],
     ["lower left corner", bottom, [0, 1]],
-    ["lower right corner", bottom, [COLUMNS - 2, COLUMNS - 1]],
+    ["lower right corner", bottom, [last - 1, last]],
   ]);
   const found = corners.find(([, row, columns]) => columns.every((column) => row[column] === 0));
   return found ? found[0] : null;

@@ -2,7 +2,7 @@
 
 import { Problem, getJson, problemOf } from "./api.js";
 import { Chart } from "./chart.js";
-import { WANTED, adviceFor, coverageOf, focusOf } from "./guidance.js";
+import { WANTED, adviceFor, coverageOf, focusOf, upright } from "./guidance.js";
 import { counted, measure } from "./numbers.js";
 import { PHOTOGRAPHS, mediaTypeOf, readShown } from "./photograph_files.js";
 import { html, useEffect, useRef, useState } from "./vendor/preact.js";
@@ -135,8 +135,8 @@ export function Photographs({ photos, query, focus, onAdd, onChange, announce })
 
 /** @param {Photo} photo that is found @returns {import("./guidance.js").Seen} */
 function seenOf({ role, look }) {
-  const { width_px: width, height_px: height, circles, blur_px: blur, distance_m: distance, tilt_deg: tilt } = look;
-  return { role, width, height, circles, blur, distance, tilt };
+  const { width_px: width, height_px: height, orientation, circles, blur_px: blur, distance_m: distance, tilt_deg: tilt } = look;
+  return { role, width, height, orientation, circles, blur, distance, tilt };
 }
 
 /**
@@ -284,23 +284,11 @@ function draw(canvas, bitmap, look) {
   pen.lineWidth = 2;
   pen.strokeStyle = "#ffd166";
   for (const { u_px: u, v_px: v, radius_px: radius } of look.circles) {
-    const [x, y] = upright(u + 0.5, v + 0.5, look);
+    const [x, y] = upright(u + 0.5, v + 0.5, look.orientation, look.width_px, look.height_px);
     pen.beginPath();
     pen.arc(x * scale, y * scale, Math.max(radius * scale, 2), 0, 2 * Math.PI);
     pen.stroke();
   }
-}
-
-/**
- * A place of the stored frame in the upright photograph.
- *
- * @param {number} x
- * @param {number} y
- * @param {{orientation: number, width_px: number, height_px: number}} look
- */
-function upright(x, y, { orientation, width_px: width, height_px: height }) {
-  const [left, up] = [width - x, height - y];
-  return /** @type {[number, number][]} */ ([[x, y], [left, y], [left, up], [x, up], [y, x], [up, x], [up, left], [y, left]])[orientation - 1];
 }
 
 /** @param {{seen: import("./guidance.js").Seen[]}} props */

@@ -28,12 +28,14 @@ export function Readout({ reading }) {
           </p>
           <dl class="facts">
             <dt>Side</dt>
-            <dd>${side}, ${percent(likelihood)}</dd>
+            <dd>${reading.depthM === null ? "–" : `${side}, ${percent(likelihood)}`}</dd>
             <dt>Or else</dt>
             <dd data-value="other">
-              ${reading.otherM === null
-                ? "no other distance fits"
-                : `${metres(reading.otherM)}, ${percent(1 - likelihood)}`}
+              ${reading.depthM === null
+                ? "–"
+                : reading.otherM === null
+                  ? "no other distance fits"
+                  : `${metres(reading.otherM)}, ${percent(1 - likelihood)}`}
             </dd>
             <dt>Blur</dt>
             <dd data-value="blur">${reading.blurPx.toFixed(2)} px</dd>

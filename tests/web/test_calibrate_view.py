@@ -123,6 +123,44 @@ def test_every_photograph_says_at_once_what_it_shows(
     assert page.evaluate(OVERFLOW) <= 0
 
 
+@pytest.mark.parametrize(
+    ("orientation", "corner"),
+    [(1, "upper left"), (3, "lower right"), (6, "upper right"), (8, "lower left")],
+)
+def test_a_corner_is_named_as_the_photograph_is_held(page: Page, orientation: int, corner: str) -> None:
+    """The circles are in every corner of the stored frames but the upper left one."""
+    places = [(595, 5), (5, 395), (595, 395), (300, 200)]
+    seen = [
+        {
+            "role": "defocused",
+            "width": 600,
+            "height": 400,
+            "orientation": orientation,
+            "circles": [{"u_px": u, "v_px": v} for u, v in places],
+            "blur": 1 + abs(distance - 1),
+            "distance": distance,
+            "tilt": 15,
+        }
+        for distance in (0.7, 0.75, 1.0, 1.4, 1.5)
+    ]
+    page.goto("#calibrate")
+    advice = page.evaluate("async (seen) => (await import('/web/guidance.js')).adviceFor(seen, 1)", seen)
+    assert advice == f"Next: one with the sheet towards the {corner} corner."
+
+
+def test_a_photograph_that_misses_its_place_does_not_replace_the_page(page: Page) -> None:
+    page.goto("#calibrate")
+    expect(page.get_by_role("heading", name="Calibrate")).to_be_visible()
+    assert page.evaluate(
+        """() => {
+          const given = new DataTransfer();
+          given.items.add(new File(["x"], "a.jpg", {type: "image/jpeg"}));
+          const drop = (kind) => new DragEvent(kind, {dataTransfer: given, bubbles: true, cancelable: true});
+          return ["dragover", "drop"].map((kind) => !document.body.dispatchEvent(drop(kind)));
+        }"""
+    ) == [True, True]
+
+
 def test_a_file_that_is_no_photograph_is_told(
     page: Page, tmp_path: Path, name: str, expected_errors: list[str]
 ) -> None:

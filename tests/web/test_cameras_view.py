@@ -15,6 +15,7 @@ from tests.web.steps import OVERFLOW
 
 JSON = {"Content-Type": "application/json"}
 LENS = {"Focal length (mm)": "35", "f-number": "2.8", "Pixel pitch (µm)": "6.05", "Sensor width (px)": "3872"}
+LENS_OF_ITS_SIZE = {"fx_px": 3000, "fy_px": 3000, "cx_px": 2000, "cy_px": 1500}
 FRAME = {"Image width (px)": "645", "Image height (px)": "432", "Focus distance (m)": "2"}
 
 
@@ -226,6 +227,30 @@ def test_a_photograph_fills_the_form_in(page: Page) -> None:
     )
     expect(page.get_by_label("Image width (px)")).not_to_have_value("")
     expect(page.get_by_text("focus_distance_m is needed")).to_be_visible()
+
+
+def test_a_photograph_takes_nothing_away_that_was_measured(page: Page, served: Server, phone: dict[str, Any]) -> None:
+    open_camera(page, served, phone | {"gamma_px": 0.83, "intrinsics": LENS_OF_ITS_SIZE})
+    page.get_by_role("button", name="Edit", exact=True).click()
+    page.get_by_text("More: gamma").click()
+    expect(page.get_by_label("fx (px)")).to_have_value("3000")
+    page.get_by_label("Fill in from a photograph it took").set_input_files(
+        Path(__file__).parents[2] / "docs/pictures/coffee.jpg"
+    )
+    expect(page.get_by_label("fx (px)")).to_have_value("")  # of another size of picture
+    expect(page.get_by_label("Name", exact=True)).to_have_value(phone["name"])
+    expect(page.get_by_label("gamma (px)")).to_have_value("0.83")
+
+
+def test_the_way_back_leaves_an_edit_as_it_is(page: Page, served: Server, phone: dict[str, Any]) -> None:
+    assert served.add(phone) == 201
+    page.goto("")
+    page.goto(f"#cameras/{phone['name']}")
+    page.get_by_role("button", name="Edit", exact=True).click()
+    page.get_by_label("Focus distance (m)").fill("1.23")
+    page.get_by_role("tab", name="Status").click()
+    page.go_back()
+    expect(page.get_by_label("Focus distance (m)")).to_have_value("1.23")
 
 
 def test_cameras_fit_a_phone_and_the_dark(
