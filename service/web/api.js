@@ -23,36 +23,33 @@ export const KEY_CHANGED = "camind:key";
 
 /** Why a request failed: the service's problem+json, or that it does not answer (status 0). */
 export class Problem extends Error {
-  /** @param {{status: number, title: string, detail: string, type?: string, errors?: FieldProblem[], requestId?: string | null, retryAfterS?: number | null}} about */
-  constructor({ status, title, detail, type = "about:blank", errors = [], requestId = null, retryAfterS = null }) {
-    super(detail);
-    this.status = status;
-    this.type = type;
-    this.title = title;
-    this.detail = detail;
-    this.errors = errors;
-    this.requestId = requestId;
-    this.retryAfterS = retryAfterS;
-  }
+	/** @param {{status: number, title: string, detail: string, type?: string, errors?: FieldProblem[], requestId?: string | null, retryAfterS?: number | null}} about */
+	constructor({ status, title, detail, type = "about:blank", errors = [], requestId = null, retryAfterS = null }) {
+		super(detail);
+		this.status = status;
+		this.type = type;
+		this.title = title;
+		this.detail = detail;
+		this.errors = errors;
+		this.requestId = requestId;
+		this.retryAfterS = retryAfterS;
+	}
 }
 
-/**
- * @param {unknown} error
- * @returns {Problem} the error, if it is one; else it is thrown on
- */
+/** @param {unknown} error @returns {Problem} the error, if it is one; else it is thrown on */
 export function problemOf(error) {
-  if (error instanceof Problem) return error;
-  throw error;
+	if (error instanceof Problem) return error;
+	throw error;
 }
 
 /** @returns {string | null} the API key of this tab */
 export function storedKey() {
-  return sessionStorage.getItem(KEY);
+	return sessionStorage.getItem(KEY);
 }
 
 export function forgetKey() {
-  sessionStorage.removeItem(KEY);
-  dispatchEvent(new Event(KEY_CHANGED));
+	sessionStorage.removeItem(KEY);
+	dispatchEvent(new Event(KEY_CHANGED));
 }
 
 /** @type {KeyAsker} */
@@ -60,27 +57,23 @@ let ask = async () => null;
 
 /** @param {KeyAsker} asker shows why the last key was refused, or null, and gives the key or null */
 export function setKeyAsker(asker) {
-  ask = asker;
+	ask = asker;
 }
 
 /** @type {Promise<string | null> | null} */
 let asking = null;
 
-/**
- * The key, asked for once however many requests want it.
- *
- * @param {string | null} reason
- */
+/** The key, asked for once however many requests want it. @param {string | null} reason */
 async function askedKey(reason) {
-  asking ??= ask(reason).finally(() => {
-    asking = null;
-  });
-  const key = await asking;
-  if (key !== null && key !== storedKey()) {
-    sessionStorage.setItem(KEY, key);
-    dispatchEvent(new Event(KEY_CHANGED));
-  }
-  return key;
+	asking ??= ask(reason).finally(() => {
+		asking = null;
+	});
+	const key = await asking;
+	if (key !== null && key !== storedKey()) {
+		sessionStorage.setItem(KEY, key);
+		dispatchEvent(new Event(KEY_CHANGED));
+	}
+	return key;
 }
 
 /**
@@ -93,51 +86,47 @@ async function askedKey(reason) {
  * @returns {Promise<T>}
  */
 async function withKey(send, toProblem, { headers = {}, asks = true }) {
-  for (;;) {
-    const key = storedKey();
-    const answer = await send(key ? { ...headers, Authorization: `Bearer ${key}` } : headers);
-    if (answer.status >= 200 && answer.status < 300) return answer;
-    const problem = await toProblem(answer);
-    if (answer.status !== 401) throw problem;
-    if (key !== null && key === storedKey()) forgetKey();
-    const hasAnother = storedKey() !== null;
-    if (!hasAnother && (!asks || (await askedKey(key && problem.detail)) === null)) throw problem;
-  }
+	for (;;) {
+		const key = storedKey();
+		const answer = await send(key ? { ...headers, Authorization: `Bearer ${key}` } : headers);
+		if (answer.status >= 200 && answer.status < 300) return answer;
+		const problem = await toProblem(answer);
+		if (answer.status !== 401) throw problem;
+		if (key !== null && key === storedKey()) forgetKey();
+		const hasAnother = storedKey() !== null;
+		if (!hasAnother && (!asks || (await askedKey(key && problem.detail)) === null)) throw problem;
+	}
 }
 
 /** @param {unknown} error */
 function asProblem(error) {
-  const isOurs = error instanceof Problem || (error instanceof DOMException && error.name === "AbortError");
-  return isOurs ? error : noAnswer();
+	const isOurs = error instanceof Problem || (error instanceof DOMException && error.name === "AbortError");
+	return isOurs ? error : noAnswer();
 }
 
 function noAnswer() {
-  const detail = "Check that it runs and that this device reaches it, then try again.";
-  return new Problem({ status: 0, title: "The service does not answer.", detail });
+	const detail = "Check that it runs and that this device reaches it, then try again.";
+	return new Problem({ status: 0, title: "The service does not answer.", detail });
 }
 
-/**
- * @param {number} status
- * @param {Headers} headers
- * @param {string} text
- */
+/** @param {number} status @param {Headers} headers @param {string} text */
 function readProblem(status, headers, text) {
-  /** @type {any} */
-  let told = {};
-  try {
-    told = JSON.parse(text) ?? {};
-  } catch {
-    // what stands in front of the service answers in its own words
-  }
-  return new Problem({
-    status,
-    type: String(told.type ?? "about:blank"),
-    title: String(told.title ?? `The request failed (${status}).`),
-    detail: String(told.detail ?? "The answer is not the service's own: something in front of it may have refused."),
-    errors: Array.isArray(told.errors) ? told.errors : [],
-    requestId: headers.get("X-Request-Id"),
-    retryAfterS: Number(headers.get("Retry-After")) || null,
-  });
+	/** @type {any} */
+	let told = {};
+	try {
+		told = JSON.parse(text) ?? {};
+	} catch {
+		// what stands in front of the service answers in its own words
+	}
+	return new Problem({
+		status,
+		type: String(told.type ?? "about:blank"),
+		title: String(told.title ?? `The request failed (${status}).`),
+		detail: String(told.detail ?? "The answer is not the service's own: something in front of it may have refused."),
+		errors: Array.isArray(told.errors) ? told.errors : [],
+		requestId: headers.get("X-Request-Id"),
+		retryAfterS: Number(headers.get("Retry-After")) || null,
+	});
 }
 
 /**
@@ -146,16 +135,16 @@ function readProblem(status, headers, text) {
  * @returns {Promise<Response>} a 2xx answer; throws `Problem` for any other, and an AbortError where it was aborted
  */
 export async function request(path, options = {}) {
-  const { method = "GET", body = null, signal = null } = options;
-  try {
-    return await withKey(
-      (headers) => fetch(path, { method, headers, body, signal }),
-      async (answer) => readProblem(answer.status, answer.headers, await answer.text()),
-      options,
-    );
-  } catch (error) {
-    throw asProblem(error);
-  }
+	const { method = "GET", body = null, signal = null } = options;
+	try {
+		return await withKey(
+			(headers) => fetch(path, { method, headers, body, signal }),
+			async (answer) => readProblem(answer.status, answer.headers, await answer.text()),
+			options,
+		);
+	} catch (error) {
+		throw asProblem(error);
+	}
 }
 
 /**
@@ -167,12 +156,12 @@ export async function request(path, options = {}) {
  * @returns {Promise<any>}
  */
 async function read(kind, path, options) {
-  const answer = await request(path, options);
-  try {
-    return await answer[kind]();
-  } catch (error) {
-    throw asProblem(error);
-  }
+	const answer = await request(path, options);
+	try {
+		return await answer[kind]();
+	} catch (error) {
+		throw asProblem(error);
+	}
 }
 
 /** @param {string} path @param {RequestOptions} [options] @returns {Promise<any>} */
@@ -186,32 +175,28 @@ export const getText = (path, options) => read("text", path, options);
 
 /** @param {string} path @param {unknown} body @param {RequestOptions} [options] @returns {Promise<any>} */
 export function sendJson(path, body, { method = "POST", headers = {}, ...options } = {}) {
-  const about = { ...headers, "Content-Type": "application/json" };
-  return getJson(path, { ...options, method, headers: about, body: JSON.stringify(body) });
+	const about = { ...headers, "Content-Type": "application/json" };
+	return getJson(path, { ...options, method, headers: about, body: JSON.stringify(body) });
 }
 
-/**
- * @param {any} camera
- * @param {number | null} revision that it replaces; null for a new camera
- * @returns {Promise<any>} the camera as it is stored
- */
+/** @param {any} camera @param {number | null} revision that it replaces; null for a new camera @returns {Promise<any>} the camera as it is stored */
 export function storeCamera(camera, revision) {
-  if (revision === null) return sendJson("cameras", camera);
-  const headers = { "If-Match": `"${revision}"` };
-  return sendJson(`cameras/${encodeURIComponent(camera.name)}`, camera, { method: "PUT", headers });
+	if (revision === null) return sendJson("cameras", camera);
+	const headers = { "If-Match": `"${revision}"` };
+	return sendJson(`cameras/${encodeURIComponent(camera.name)}`, camera, { method: "PUT", headers });
 }
 
 /** @returns {Promise<any[]>} the cameras as they are now, by name */
 export async function everyCamera() {
-  const found = [];
-  let cursor = null;
-  do {
-    const after = cursor === null ? "" : `&cursor=${encodeURIComponent(cursor)}`;
-    const page = await getJson(`cameras?limit=200${after}`);
-    found.push(...page.items);
-    cursor = page.next_cursor;
-  } while (cursor !== null);
-  return found;
+	const found = [];
+	let cursor = null;
+	do {
+		const after = cursor === null ? "" : `&cursor=${encodeURIComponent(cursor)}`;
+		const page = await getJson(`cameras?limit=200${after}`);
+		found.push(...page.items);
+		cursor = page.next_cursor;
+	} while (cursor !== null);
+	return found;
 }
 
 /**
@@ -223,18 +208,18 @@ export async function everyCamera() {
  * @returns {Promise<{status: number, headers: Headers, body: any}>}
  */
 export async function upload(path, options = {}) {
-  return withKey(
-    (headers) => sendWithProgress(path, { ...options, headers }),
-    async ({ status, headers, body }) => readProblem(status, headers, await asText(body)),
-    options,
-  );
+	return withKey(
+		(headers) => sendWithProgress(path, { ...options, headers }),
+		async ({ status, headers, body }) => readProblem(status, headers, await asText(body)),
+		options,
+	);
 }
 
 /** @param {unknown} body */
 async function asText(body) {
-  if (body instanceof ArrayBuffer) return new TextDecoder().decode(body);
-  if (body instanceof Blob) return body.text();
-  return typeof body === "string" ? body : JSON.stringify(body);
+	if (body instanceof ArrayBuffer) return new TextDecoder().decode(body);
+	if (body instanceof Blob) return body.text();
+	return typeof body === "string" ? body : JSON.stringify(body);
 }
 
 /**
@@ -243,28 +228,28 @@ async function asText(body) {
  * @returns {Promise<{status: number, headers: Headers, body: any}>}
  */
 function sendWithProgress(path, { method = "POST", headers = {}, body = null, signal, onProgress, responseType = "" }) {
-  return new Promise((resolve, reject) => {
-    const sent = new XMLHttpRequest();
-    const abort = () => sent.abort();
-    sent.open(method, path);
-    sent.responseType = responseType;
-    for (const [name, value] of Object.entries(headers)) sent.setRequestHeader(name, value);
-    if (onProgress) {
-      sent.upload.onprogress = ({ lengthComputable, loaded, total }) =>
-        onProgress(lengthComputable && total > 0 ? loaded / total : null);
-    }
-    sent.onload = () => {
-      const lines = sent.getAllResponseHeaders().trim().split("\r\n");
-      const pairs = lines.map((line) => /** @type {[string, string]} */ (line.split(/:\s*(.*)/s).slice(0, 2)));
-      resolve({ status: sent.status, headers: new Headers(pairs.filter(([name]) => name)), body: sent.response });
-    };
-    sent.onerror = () => reject(noAnswer());
-    sent.onabort = () => reject(new DOMException("The request was aborted.", "AbortError"));
-    sent.onloadend = () => signal?.removeEventListener("abort", abort);
-    signal?.addEventListener("abort", abort);
-    if (signal?.aborted) reject(new DOMException("The request was aborted.", "AbortError"));
-    else sent.send(body);
-  });
+	return new Promise((resolve, reject) => {
+		const sent = new XMLHttpRequest();
+		const abort = () => sent.abort();
+		sent.open(method, path);
+		sent.responseType = responseType;
+		for (const [name, value] of Object.entries(headers)) sent.setRequestHeader(name, value);
+		if (onProgress) {
+			sent.upload.onprogress = ({ lengthComputable, loaded, total }) =>
+				onProgress(lengthComputable && total > 0 ? loaded / total : null);
+		}
+		sent.onload = () => {
+			const lines = sent.getAllResponseHeaders().trim().split("\r\n");
+			const pairs = lines.map((line) => /** @type {[string, string]} */ (line.split(/:\s*(.*)/s).slice(0, 2)));
+			resolve({ status: sent.status, headers: new Headers(pairs.filter(([name]) => name)), body: sent.response });
+		};
+		sent.onerror = () => reject(noAnswer());
+		sent.onabort = () => reject(new DOMException("The request was aborted.", "AbortError"));
+		sent.onloadend = () => signal?.removeEventListener("abort", abort);
+		signal?.addEventListener("abort", abort);
+		if (signal?.aborted) reject(new DOMException("The request was aborted.", "AbortError"));
+		else sent.send(body);
+	});
 }
 
 /**
@@ -274,37 +259,34 @@ function sendWithProgress(path, { method = "POST", headers = {}, body = null, si
  * @param {{signal?: AbortSignal, onEvent: (event: {event: string, data: string}) => void}} options
  */
 export async function events(path, { signal, onEvent }) {
-  const answer = await request(path, { signal, asks: false, headers: { Accept: "text/event-stream" } });
-  const reader = /** @type {ReadableStream<Uint8Array>} */ (answer.body).getReader();
-  const decoder = new TextDecoder();
-  let text = "";
-  try {
-    for (;;) {
-      const { done, value } = await reader.read();
-      if (done) return;
-      // a line may end in two characters, of which only the first has come
-      text = (text + decoder.decode(value, { stream: true })).replace(/\r\n|\r(?!$)/g, "\n");
-      const blocks = text.split("\n\n");
-      text = /** @type {string} */ (blocks.pop());
-      for (const block of blocks) readEvent(block, onEvent);
-    }
-  } catch (error) {
-    throw asProblem(error);
-  }
+	const answer = await request(path, { signal, asks: false, headers: { Accept: "text/event-stream" } });
+	const reader = /** @type {ReadableStream<Uint8Array>} */ (answer.body).getReader();
+	const decoder = new TextDecoder();
+	let text = "";
+	try {
+		for (;;) {
+			const { done, value } = await reader.read();
+			if (done) return;
+			// a line may end in two characters, of which only the first has come
+			text = (text + decoder.decode(value, { stream: true })).replace(/\r\n|\r(?!$)/g, "\n");
+			const blocks = text.split("\n\n");
+			text = /** @type {string} */ (blocks.pop());
+			for (const block of blocks) readEvent(block, onEvent);
+		}
+	} catch (error) {
+		throw asProblem(error);
+	}
 }
 
-/**
- * @param {string} block
- * @param {(event: {event: string, data: string}) => void} onEvent
- */
+/** @param {string} block @param {(event: {event: string, data: string}) => void} onEvent */
 function readEvent(block, onEvent) {
-  /** @type {string[]} */
-  const data = [];
-  let event = "message";
-  for (const line of block.split("\n")) {
-    const [, name, value] = /^([^:]*):? ?(.*)$/s.exec(line) ?? [];
-    if (name === "event") event = value;
-    if (name === "data") data.push(value);
-  }
-  if (data.length > 0) onEvent({ event, data: data.join("\n") });
+	/** @type {string[]} */
+	const data = [];
+	let event = "message";
+	for (const line of block.split("\n")) {
+		const [, name, value] = /^([^:]*):? ?(.*)$/s.exec(line) ?? [];
+		if (name === "event") event = value;
+		if (name === "data") data.push(value);
+	}
+	if (data.length > 0) onEvent({ event, data: data.join("\n") });
 }

@@ -25,146 +25,146 @@ import { html, render, useCallback, useEffect, useState } from "./vendor/preact.
 
 /** @type {{tab: Tab, title: string, View: (props: ViewProps) => any}[]} */
 const TABS = [
-  { tab: "depth", title: "Depth", View: DepthView },
-  { tab: "cameras", title: "Cameras", View: CamerasView },
-  { tab: "calibrate", title: "Calibrate", View: CalibrateView },
-  { tab: "status", title: "Status", View: StatusView },
+	{ tab: "depth", title: "Depth", View: DepthView },
+	{ tab: "cameras", title: "Cameras", View: CamerasView },
+	{ tab: "calibrate", title: "Calibrate", View: CalibrateView },
+	{ tab: "status", title: "Status", View: StatusView },
 ];
 
 /** @returns {{tab: Tab, camera: string | null}} from `#tab` or `#tab/camera` */
 function readHash() {
-  const [name, camera = null] = location.hash.slice(1).split("/", 2);
-  const known = TABS.find(({ tab }) => tab === name) ?? TABS[0];
-  try {
-    return { tab: known.tab, camera: camera && decodeURIComponent(camera) };
-  } catch {
-    return { tab: known.tab, camera: null };
-  }
+	const [name, camera = null] = location.hash.slice(1).split("/", 2);
+	const known = TABS.find(({ tab }) => tab === name) ?? TABS[0];
+	try {
+		return { tab: known.tab, camera: camera && decodeURIComponent(camera) };
+	} catch {
+		return { tab: known.tab, camera: null };
+	}
 }
 
 /** @type {ViewProps["go"]} */
 function go(tab, { camera } = {}) {
-  location.hash = camera ? `${tab}/${encodeURIComponent(camera)}` : tab;
+	location.hash = camera ? `${tab}/${encodeURIComponent(camera)}` : tab;
 }
 
 function useHash() {
-  const [place, setPlace] = useState(readHash);
-  useEffect(() => {
-    const read = () => {
-      const found = readHash();
-      setPlace(found);
-      // it is brought once: on the way back it would take the place of what was chosen or typed since
-      if (found.camera) history.replaceState(null, "", `#${found.tab}`);
-    };
-    read();
-    addEventListener("hashchange", read);
-    return () => removeEventListener("hashchange", read);
-  }, []);
-  return place;
+	const [place, setPlace] = useState(readHash);
+	useEffect(() => {
+		const read = () => {
+			const found = readHash();
+			setPlace(found);
+			// it is brought once: on the way back it would take the place of what was chosen or typed since
+			if (found.camera) history.replaceState(null, "", `#${found.tab}`);
+		};
+		read();
+		addEventListener("hashchange", read);
+		return () => removeEventListener("hashchange", read);
+	}, []);
+	return place;
 }
 
 function App() {
-  const place = useHash();
-  const [cameras, setCameras] = useState(/** @type {any[] | null} */ (null));
-  const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
-  const [said, setSaid] = useState("");
-  const [hasKey, setHasKey] = useState(storedKey() !== null);
+	const place = useHash();
+	const [cameras, setCameras] = useState(/** @type {any[] | null} */ (null));
+	const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
+	const [said, setSaid] = useState("");
+	const [hasKey, setHasKey] = useState(storedKey() !== null);
 
-  const reloadCameras = useCallback(async () => {
-    try {
-      setCameras(await everyCamera());
-      setProblem(null);
-    } catch (error) {
-      setProblem(problemOf(error));
-    }
-  }, []);
-  const announce = useCallback((/** @type {string} */ text) => {
-    // the same words again are said again
-    setSaid((before) => (before === text ? `${text}\u00a0` : text));
-  }, []);
-  useEffect(() => {
-    reloadCameras();
-  }, []);
-  useEffect(() => {
-    // what misses its place must not be opened instead of the page, which would be lost
-    const keep = (/** @type {DragEvent} */ event) => {
-      if (event.dataTransfer?.types.includes("Files")) event.preventDefault();
-    };
-    for (const kind of /** @type {const} */ (["dragover", "drop"])) document.addEventListener(kind, keep);
-    return () => {
-      for (const kind of /** @type {const} */ (["dragover", "drop"])) document.removeEventListener(kind, keep);
-    };
-  }, []);
-  useEffect(() => {
-    function onKeyChanged() {
-      setHasKey(storedKey() !== null);
-      if (problem !== null && storedKey() !== null) reloadCameras();
-    }
-    addEventListener(KEY_CHANGED, onKeyChanged);
-    return () => removeEventListener(KEY_CHANGED, onKeyChanged);
-  }, [problem]);
+	const reloadCameras = useCallback(async () => {
+		try {
+			setCameras(await everyCamera());
+			setProblem(null);
+		} catch (error) {
+			setProblem(problemOf(error));
+		}
+	}, []);
+	const announce = useCallback((/** @type {string} */ text) => {
+		// the same words again are said again
+		setSaid((before) => (before === text ? `${text}\u00a0` : text));
+	}, []);
+	useEffect(() => {
+		reloadCameras();
+	}, []);
+	useEffect(() => {
+		// what misses its place must not be opened instead of the page, which would be lost
+		const keep = (/** @type {DragEvent} */ event) => {
+			if (event.dataTransfer?.types.includes("Files")) event.preventDefault();
+		};
+		for (const kind of /** @type {const} */ (["dragover", "drop"])) document.addEventListener(kind, keep);
+		return () => {
+			for (const kind of /** @type {const} */ (["dragover", "drop"])) document.removeEventListener(kind, keep);
+		};
+	}, []);
+	useEffect(() => {
+		function onKeyChanged() {
+			setHasKey(storedKey() !== null);
+			if (problem !== null && storedKey() !== null) reloadCameras();
+		}
+		addEventListener(KEY_CHANGED, onKeyChanged);
+		return () => removeEventListener(KEY_CHANGED, onKeyChanged);
+	}, [problem]);
 
-  /** @param {KeyboardEvent} event */
-  function onKeyDown(event) {
-    const at = TABS.findIndex(({ tab }) => tab === place.tab);
-    const to = { ArrowLeft: at - 1, ArrowRight: at + 1, Home: 0, End: TABS.length - 1, " ": at }[event.key];
-    if (to === undefined || event.altKey || event.ctrlKey || event.metaKey) return;
-    event.preventDefault();
-    const { tab } = TABS[(to + TABS.length) % TABS.length];
-    go(tab);
-    document.getElementById(`tab-${tab}`)?.focus();
-  }
+	/** @param {KeyboardEvent} event */
+	function onKeyDown(event) {
+		const at = TABS.findIndex(({ tab }) => tab === place.tab);
+		const to = { ArrowLeft: at - 1, ArrowRight: at + 1, Home: 0, End: TABS.length - 1, " ": at }[event.key];
+		if (to === undefined || event.altKey || event.ctrlKey || event.metaKey) return;
+		event.preventDefault();
+		const { tab } = TABS[(to + TABS.length) % TABS.length];
+		go(tab);
+		document.getElementById(`tab-${tab}`)?.focus();
+	}
 
-  return html`
-    <header class="bar">
-      <h1><a href="#depth">camind</a></h1>
-      <nav role="tablist" aria-label="Parts of the page" onKeyDown=${onKeyDown}>
-        ${TABS.map(
-          ({ tab, title }) => html`<a
-            key=${tab}
-            id=${`tab-${tab}`}
-            role="tab"
-            href=${`#${tab}`}
-            aria-selected=${tab === place.tab}
-            aria-controls=${`panel-${tab}`}
-            tabindex=${tab === place.tab ? 0 : -1}
-            >${title}</a
-          >`,
-        )}
-      </nav>
-      ${hasKey &&
-      html`<button
-        type="button"
-        class="quiet"
-        onClick=${() => {
-          forgetKey();
-          location.reload();
-        }}
-      >
-        Forget API key
-      </button>`}
-    </header>
-    <main>
-      <${ProblemBox} problem=${problem} onRetry=${reloadCameras} />
-      ${TABS.map(
-        ({ tab, View }) => html`<section
-          key=${tab}
-          id=${`panel-${tab}`}
-          role="tabpanel"
-          aria-labelledby=${`tab-${tab}`}
-          hidden=${tab !== place.tab}
-        >
-          <${View}
-            shown=${tab === place.tab}
-            camera=${tab === place.tab ? place.camera : null}
-            ...${{ cameras, reloadCameras, go, announce }}
-          />
-        </section>`,
-      )}
-    </main>
-    <p class="visually-hidden" role="status" aria-live="polite">${said}</p>
-    <${KeyDialog} />
-  `;
+	return html`
+		<header class="bar">
+			<h1><a href="#depth">camind</a></h1>
+			<nav role="tablist" aria-label="Parts of the page" onKeyDown=${onKeyDown}>
+				${TABS.map(
+					({ tab, title }) => html`<a
+						key=${tab}
+						id=${`tab-${tab}`}
+						role="tab"
+						href=${`#${tab}`}
+						aria-selected=${tab === place.tab}
+						aria-controls=${`panel-${tab}`}
+						tabindex=${tab === place.tab ? 0 : -1}
+						>${title}</a
+					>`,
+				)}
+			</nav>
+			${hasKey &&
+			html`<button
+				type="button"
+				class="quiet"
+				onClick=${() => {
+					forgetKey();
+					location.reload();
+				}}
+			>
+				Forget API key
+			</button>`}
+		</header>
+		<main>
+			<${ProblemBox} problem=${problem} onRetry=${reloadCameras} />
+			${TABS.map(
+				({ tab, View }) => html`<section
+					key=${tab}
+					id=${`panel-${tab}`}
+					role="tabpanel"
+					aria-labelledby=${`tab-${tab}`}
+					hidden=${tab !== place.tab}
+				>
+					<${View}
+						shown=${tab === place.tab}
+						camera=${tab === place.tab ? place.camera : null}
+						...${{ cameras, reloadCameras, go, announce }}
+					/>
+				</section>`,
+			)}
+		</main>
+		<p class="visually-hidden" role="status" aria-live="polite">${said}</p>
+		<${KeyDialog} />
+	`;
 }
 
 render(html`<${App} />`, document.body);

@@ -21,220 +21,218 @@ const TONES = { succeeded: "good", failed: "bad", running: "warn", queued: "warn
 
 /** @param {import("./app.js").ViewProps} props */
 export function CalibrateView({ shown, cameras, camera, reloadCameras, go, announce }) {
-  const [step, setStep] = useState(0);
-  const [sheet, setSheet] = useState(SHEET);
-  const [photos, setPhotos] = useState(/** @type {Photo[]} */ ([]));
-  const [name, setName] = useState("");
-  const [focus, setFocus] = useState("");
-  const [job, setJob] = useState(/** @type {any | null} */ (null));
-  const [recent, setRecent] = useState(/** @type {any[]} */ ([]));
-  const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
-  const [attempt, setAttempt] = useState(0);
-  const [sent, setSent] = useState(/** @type {number | null | undefined} */ (undefined));
-  const title = useRef(/** @type {HTMLHeadingElement | null} */ (null));
-  const hasMoved = useRef(false);
-  const requestKey = useRef("");
-  const known = cameras?.find((one) => one.name === name.trim()) ?? null;
-  const focusM = toMetres(focus);
-  const about = new URLSearchParams(Object.entries(patternOf(sheet)).map(([field, value]) => [field, String(value)]));
-  if (known) about.set("camera", known.name);
-  const query = isMeasured(sheet) ? String(about) : "";
+	const [step, setStep] = useState(0);
+	const [sheet, setSheet] = useState(SHEET);
+	const [photos, setPhotos] = useState(/** @type {Photo[]} */ ([]));
+	const [name, setName] = useState("");
+	const [focus, setFocus] = useState("");
+	const [job, setJob] = useState(/** @type {any | null} */ (null));
+	const [recent, setRecent] = useState(/** @type {any[]} */ ([]));
+	const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
+	const [attempt, setAttempt] = useState(0);
+	const [sent, setSent] = useState(/** @type {number | null | undefined} */ (undefined));
+	const title = useRef(/** @type {HTMLHeadingElement | null} */ (null));
+	const hasMoved = useRef(false);
+	const requestKey = useRef("");
+	const known = cameras?.find((one) => one.name === name.trim()) ?? null;
+	const focusM = toMetres(focus);
+	const about = new URLSearchParams(Object.entries(patternOf(sheet)).map(([field, value]) => [field, String(value)]));
+	if (known) about.set("camera", known.name);
+	const query = isMeasured(sheet) ? String(about) : "";
 
-  useLooks(photos, setPhotos, query);
-  useJob(job, attempt, setJob, setProblem, (done) => {
-    announce(`The calibration ${done.state === "cancelled" ? "is" : "has"} ${done.state}.`);
-    setStep((now) => (now === 2 ? 3 : now)); // who has gone elsewhere is left there
-    if (done.camera_revision !== null) reloadCameras();
-  });
+	useLooks(photos, setPhotos, query);
+	useJob(job, attempt, setJob, setProblem, (done) => {
+		announce(`The calibration ${done.state === "cancelled" ? "is" : "has"} ${done.state}.`);
+		setStep((now) => (now === 2 ? 3 : now)); // who has gone elsewhere is left there
+		if (done.camera_revision !== null) reloadCameras();
+	});
 
-  /** @param {number} to */
-  function move(to) {
-    hasMoved.current = true;
-    setStep(to);
-  }
+	/** @param {number} to */
+	function move(to) {
+		hasMoved.current = true;
+		setStep(to);
+	}
 
-  useEffect(() => {
-    if (hasMoved.current) title.current?.focus();
-  }, [step]);
-  useEffect(() => {
-    if (shown && camera) setName(camera);
-  }, [shown, camera]);
-  useEffect(() => {
-    requestKey.current = "";
-  }, [photos.map(({ id, role }) => id + role).join(), query, name, focus]);
-  useEffect(() => {
-    if (shown) loadRecent();
-  }, [shown, job?.state, job?.camera_revision, storedKey()]);
+	useEffect(() => {
+		if (hasMoved.current) title.current?.focus();
+	}, [step]);
+	useEffect(() => {
+		if (shown && camera) setName(camera);
+	}, [shown, camera]);
+	useEffect(() => {
+		requestKey.current = "";
+	}, [photos.map(({ id, role }) => id + role).join(), query, name, focus]);
+	useEffect(() => {
+		if (shown) loadRecent();
+	}, [shown, job?.state, job?.camera_revision, storedKey()]);
 
-  async function loadRecent() {
-    try {
-      const { items } = await getJson(`calibrations?limit=${RECENT}`, { asks: false });
-      setRecent(items);
-      const live = items.find((/** @type {any} */ one) => !FINAL.has(one.state));
-      // one that ran on while the page was away
-      if (live && job === null && photos.length === 0 && step === 0) open(live.id);
-    } catch (error) {
-      problemOf(error);
-    }
-  }
+	async function loadRecent() {
+		try {
+			const { items } = await getJson(`calibrations?limit=${RECENT}`, { asks: false });
+			setRecent(items);
+			const live = items.find((/** @type {any} */ one) => !FINAL.has(one.state));
+			// one that ran on while the page was away
+			if (live && job === null && photos.length === 0 && step === 0) open(live.id);
+		} catch (error) {
+			problemOf(error);
+		}
+	}
 
-  /** @param {string} id */
-  async function open(id) {
-    try {
-      const found = await getJson(`calibrations/${id}`);
-      setJob(found);
-      move(FINAL.has(found.state) ? 3 : 2);
-      setProblem(null);
-      setAttempt((count) => count + 1);
-    } catch (error) {
-      setProblem(problemOf(error));
-    }
-  }
+	/** @param {string} id */
+	async function open(id) {
+		try {
+			const found = await getJson(`calibrations/${id}`);
+			setJob(found);
+			move(FINAL.has(found.state) ? 3 : 2);
+			setProblem(null);
+			setAttempt((count) => count + 1);
+		} catch (error) {
+			setProblem(problemOf(error));
+		}
+	}
 
-  async function start() {
-    const form = new FormData();
-    const settings = { pattern: patternOf(sheet), focus_distance_m: focusM, register: false };
-    form.append("settings", JSON.stringify(settings));
-    for (const { role, file } of photos) form.append(role, file, file.name);
-    requestKey.current ||= newKey();
-    setProblem(null);
-    setSent(0);
-    try {
-      const { body } = await upload(`calibrate?camera=${encodeURIComponent(name.trim())}`, {
-        body: form,
-        headers: { "Idempotency-Key": requestKey.current },
-        responseType: "json",
-        onProgress: setSent,
-      });
-      requestKey.current = "";
-      setJob(body);
-      move(2);
-    } catch (error) {
-      setProblem(problemOf(error));
-    } finally {
-      setSent(undefined);
-    }
-  }
+	async function start() {
+		const form = new FormData();
+		const settings = { pattern: patternOf(sheet), focus_distance_m: focusM, register: false };
+		form.append("settings", JSON.stringify(settings));
+		for (const { role, file } of photos) form.append(role, file, file.name);
+		requestKey.current ||= newKey();
+		setProblem(null);
+		setSent(0);
+		try {
+			const { body } = await upload(`calibrate?camera=${encodeURIComponent(name.trim())}`, {
+				body: form,
+				headers: { "Idempotency-Key": requestKey.current },
+				responseType: "json",
+				onProgress: setSent,
+			});
+			requestKey.current = "";
+			setJob(body);
+			move(2);
+		} catch (error) {
+			setProblem(problemOf(error));
+		} finally {
+			setSent(undefined);
+		}
+	}
 
-  const isSending = sent !== undefined;
-  const reached = job !== null ? (FINAL.has(job.state) ? 3 : 2) : 1;
-  const focusFault = problem?.errors.find(({ pointer }) => pointer === "#/settings/focus_distance_m")?.detail;
-  const nameFault = problem?.errors.find(({ pointer }) => pointer === "camera")?.detail;
-  return html`
-    <div class="stack">
-      <h2 tabindex="-1" ref=${title}>Calibrate<span class="visually-hidden">, step ${step + 1}: ${STEPS[step]}</span></h2>
-      <ol class="steps">
-        ${STEPS.map(
-          (words, number) => html`<li>
-            <button
-              type="button"
-              aria-current=${number === step ? "step" : undefined}
-              disabled=${number > reached || (number === 2 && reached === 3)}
-              onClick=${() => move(number)}
-            >
-              <span>${number + 1}</span> ${words}
-            </button>
-          </li>`,
-        )}
-      </ol>
-      ${step === 0 && html`<${SheetStep} sheet=${sheet} onChange=${setSheet} onNext=${() => move(1)} />`}
-      ${step === 1 &&
-      html`
-        <div class="card">
-          <p>
-            Lock focus, zoom and aperture. Take eight to twelve photographs of the whole sheet, some nearer and some farther than
-            what is sharp, tilted by up to 25 degrees this way and that.
-          </p>
-          <div class="pair">
-            <${TextField}
-              ...${{ id: "calibrate-name", label: "Camera", value: name, onInput: setName, fault: nameFault, list: "camera-names" }}
-              hint=${known ? `Its focal length is used for distances; the result can become its revision ${known.revision + 1}.` : "A name for what is measured."}
-            />
-            <${TextField}
-              ...${{ id: "calibrate-focus", label: "Focus distance (m), if you know it", value: focus, onInput: setFocus }}
-              fault=${focusFault ?? (focusM === undefined ? "This is no distance in metres." : undefined)}
-              hint="Left empty, it is found from the photographs."
-            />
-          </div>
-        </div>
-        <${Photographs}
-          photos=${photos}
-          query=${query}
-          focus=${focusM ?? null}
-          onAdd=${(/** @type {Photo[]} */ added) => setPhotos((before) => [...before, ...added])}
-          onChange=${setPhotos}
-          announce=${announce}
-        />
-        <${ProblemBox} problem=${nameFault || focusFault ? null : problem} />
-        <div class="row">
-          <button
-            type="button"
-            class="primary"
-            disabled=${isSending || !query || focusM === undefined || name.trim() === "" || !photos.some(({ role }) => role === "defocused")}
-            onClick=${start}
-          >
-            Start the calibration
-          </button>
-          ${name.trim() === "" && photos.length > 0 && html`<span class="hint">Name the camera first.</span>`}
-          ${!query && html`<span class="hint">Say on the sheet's page how long its ruler is.</span>`}
-          ${isSending &&
-          html`<label class="sending hint">Sending the photographs ... <progress max="1" value=${sent ?? undefined}></progress></label>`}
-        </div>
-      `}
-      ${step === 2 && job && html`<${Running} job=${job} />`}
-      ${step === 3 &&
-      job &&
-      html`<${Ended}
-        job=${job}
-        cameras=${cameras}
-        go=${go}
-        onAccepted=${async (/** @type {any} */ stored) => {
-          setJob(stored);
-          announce(`Stored as revision ${stored.camera_revision} of camera ${stored.camera}.`);
-          await reloadCameras();
-        }}
-        onDiscard=${() => {
-          announce(job.camera_revision === null ? "Discarded: nothing is stored." : "");
-          setJob(null);
-          move(photos.length > 0 ? 1 : 0);
-        }}
-        onAgain=${() => move(1)}
-      />`}
-      ${step !== 1 && html`<${ProblemBox} problem=${problem} onRetry=${step === 2 && job ? () => open(job.id) : undefined} />`}
-      <${Recent} items=${recent} open=${job?.id ?? null} onOpen=${open} />
-      <datalist id="camera-names">${(cameras ?? []).map((one) => html`<option value=${one.name}></option>`)}</datalist>
-    </div>
-  `;
+	const isSending = sent !== undefined;
+	const reached = job !== null ? (FINAL.has(job.state) ? 3 : 2) : 1;
+	const focusFault = problem?.errors.find(({ pointer }) => pointer === "#/settings/focus_distance_m")?.detail;
+	const nameFault = problem?.errors.find(({ pointer }) => pointer === "camera")?.detail;
+	return html`
+		<div class="stack">
+			<h2 tabindex="-1" ref=${title}>Calibrate<span class="visually-hidden">, step ${step + 1}: ${STEPS[step]}</span></h2>
+			<ol class="steps">
+				${STEPS.map(
+					(words, number) => html`<li>
+						<button
+							type="button"
+							aria-current=${number === step ? "step" : undefined}
+							disabled=${number > reached || (number === 2 && reached === 3)}
+							onClick=${() => move(number)}
+						>
+							<span>${number + 1}</span> ${words}
+						</button>
+					</li>`,
+				)}
+			</ol>
+			${step === 0 && html`<${SheetStep} sheet=${sheet} onChange=${setSheet} onNext=${() => move(1)} />`}
+			${step === 1 &&
+			html`
+				<div class="card">
+					<p>
+						Lock focus, zoom and aperture. Take eight to twelve photographs of the whole sheet, some nearer and some farther than
+						what is sharp, tilted by up to 25 degrees this way and that.
+					</p>
+					<div class="pair">
+						<${TextField}
+							...${{ id: "calibrate-name", label: "Camera", value: name, onInput: setName, fault: nameFault, list: "camera-names" }}
+							hint=${known ? `Its focal length is used for distances; the result can become its revision ${known.revision + 1}.` : "A name for what is measured."}
+						/>
+						<${TextField}
+							...${{ id: "calibrate-focus", label: "Focus distance (m), if you know it", value: focus, onInput: setFocus }}
+							fault=${focusFault ?? (focusM === undefined ? "This is no distance in metres." : undefined)}
+							hint="Left empty, it is found from the photographs."
+						/>
+					</div>
+				</div>
+				<${Photographs}
+					photos=${photos}
+					query=${query}
+					focus=${focusM ?? null}
+					onAdd=${(/** @type {Photo[]} */ added) => setPhotos((before) => [...before, ...added])}
+					onChange=${setPhotos}
+					announce=${announce}
+				/>
+				<${ProblemBox} problem=${nameFault || focusFault ? null : problem} />
+				<div class="row">
+					<button
+						type="button"
+						class="primary"
+						disabled=${isSending || !query || focusM === undefined || name.trim() === "" || !photos.some(({ role }) => role === "defocused")}
+						onClick=${start}
+					>
+						Start the calibration
+					</button>
+					${name.trim() === "" && photos.length > 0 && html`<span class="hint">Name the camera first.</span>`}
+					${!query && html`<span class="hint">Say on the sheet's page how long its ruler is.</span>`}
+					${isSending &&
+					html`<label class="sending hint">Sending the photographs ... <progress max="1" value=${sent ?? undefined}></progress></label>`}
+				</div>
+			`}
+			${step === 2 && job && html`<${Running} job=${job} />`}
+			${step === 3 &&
+			job &&
+			html`<${Ended}
+				job=${job}
+				cameras=${cameras}
+				go=${go}
+				onAccepted=${async (/** @type {any} */ stored) => {
+					setJob(stored);
+					announce(`Stored as revision ${stored.camera_revision} of camera ${stored.camera}.`);
+					await reloadCameras();
+				}}
+				onDiscard=${() => {
+					announce(job.camera_revision === null ? "Discarded: nothing is stored." : "");
+					setJob(null);
+					move(photos.length > 0 ? 1 : 0);
+				}}
+				onAgain=${() => move(1)}
+			/>`}
+			${step !== 1 && html`<${ProblemBox} problem=${problem} onRetry=${step === 2 && job ? () => open(job.id) : undefined} />`}
+			<${Recent} items=${recent} open=${job?.id ?? null} onOpen=${open} />
+			<datalist id="camera-names">${(cameras ?? []).map((one) => html`<option value=${one.name}></option>`)}</datalist>
+		</div>
+	`;
 }
 
-/**
- * @param {{items: any[], open: string | null, onOpen: (id: string) => void}} props
- */
+/** @param {{items: any[], open: string | null, onOpen: (id: string) => void}} props */
 function Recent({ items, open, onOpen }) {
-  if (items.length === 0) return null;
-  return html`
-    <details class="card" open>
-      <summary>Recent calibrations</summary>
-      <${Table} label="Recent calibrations" head=${["Camera", "Begun", "State", ""]}>
-        ${items.map(
-          (one) => html`<tr key=${one.id}>
-            <th scope="row" class="file">${one.camera}</th>
-            <td>${when(one.created_at)}</td>
-            <td>
-              <span class=${`badge ${TONES[one.state] ?? ""}`}>${one.state}</span>
-              ${one.camera_revision !== null && html` <span class="hint">revision ${one.camera_revision}</span>`}
-            </td>
-            <td class="number">
-              ${one.id !== open &&
-              html`<button type="button" class="quiet" aria-label=${`Open the calibration of ${one.camera}, ${one.state}`} onClick=${() => onOpen(one.id)}>
-                Open
-              </button>`}
-            </td>
-          </tr>`,
-        )}
-      <//>
-    </details>
-  `;
+	if (items.length === 0) return null;
+	return html`
+		<details class="card" open>
+			<summary>Recent calibrations</summary>
+			<${Table} label="Recent calibrations" head=${["Camera", "Begun", "State", ""]}>
+				${items.map(
+					(one) => html`<tr key=${one.id}>
+						<th scope="row" class="file">${one.camera}</th>
+						<td>${when(one.created_at)}</td>
+						<td>
+							<span class=${`badge ${TONES[one.state] ?? ""}`}>${one.state}</span>
+							${one.camera_revision !== null && html` <span class="hint">revision ${one.camera_revision}</span>`}
+						</td>
+						<td class="number">
+							${one.id !== open &&
+							html`<button type="button" class="quiet" aria-label=${`Open the calibration of ${one.camera}, ${one.state}`} onClick=${() => onOpen(one.id)}>
+								Open
+							</button>`}
+						</td>
+					</tr>`,
+				)}
+			<//>
+		</details>
+	`;
 }
 
 /**
@@ -247,48 +245,48 @@ function Recent({ items, open, onOpen }) {
  * @param {(job: any) => void} onEnd
  */
 function useJob(job, attempt, setJob, setProblem, onEnd) {
-  const live = job !== null && !FINAL.has(job.state) ? job.id : null;
-  useEffect(() => {
-    if (live === null) return undefined;
-    const stop = new AbortController();
-    const follow = async () => {
-      while (!stop.signal.aborted) {
-        let waitMs = AGAIN_MS;
-        try {
-          await events(`calibrations/${live}/events`, {
-            signal: stop.signal,
-            onEvent: ({ data }) => {
-              const now = JSON.parse(data);
-              setJob(now);
-              setProblem(null);
-              if (FINAL.has(now.state)) {
-                stop.abort();
-                onEnd(now);
-              }
-            },
-          });
-        } catch (error) {
-          if (stop.signal.aborted) return;
-          const problem = problemOf(error);
-          setProblem(problem);
-          if ([401, 403, 404].includes(problem.status)) return;
-          waitMs = 1000 * (problem.retryAfterS ?? 1);
-        }
-        await new Promise((resolve) => setTimeout(resolve, waitMs));
-      }
-    };
-    follow();
-    return () => stop.abort();
-  }, [live, attempt]);
+	const live = job !== null && !FINAL.has(job.state) ? job.id : null;
+	useEffect(() => {
+		if (live === null) return undefined;
+		const stop = new AbortController();
+		const follow = async () => {
+			while (!stop.signal.aborted) {
+				let waitMs = AGAIN_MS;
+				try {
+					await events(`calibrations/${live}/events`, {
+						signal: stop.signal,
+						onEvent: ({ data }) => {
+							const now = JSON.parse(data);
+							setJob(now);
+							setProblem(null);
+							if (FINAL.has(now.state)) {
+								stop.abort();
+								onEnd(now);
+							}
+						},
+					});
+				} catch (error) {
+					if (stop.signal.aborted) return;
+					const problem = problemOf(error);
+					setProblem(problem);
+					if ([401, 403, 404].includes(problem.status)) return;
+					waitMs = 1000 * (problem.retryAfterS ?? 1);
+				}
+				await new Promise((resolve) => setTimeout(resolve, waitMs));
+			}
+		};
+		follow();
+		return () => stop.abort();
+	}, [live, attempt]);
 }
 
 /** @param {string} text @returns {number | null | undefined} null for none, undefined for what is no distance */
 function toMetres(text) {
-  if (text.trim() === "") return null;
-  const value = decimal(text);
-  return Number.isFinite(value) && value > 0 ? value : undefined;
+	if (text.trim() === "") return null;
+	const value = decimal(text);
+	return Number.isFinite(value) && value > 0 ? value : undefined;
 }
 
 function newKey() {
-  return [...crypto.getRandomValues(new Uint8Array(16))].map((byte) => byte.toString(16).padStart(2, "0")).join("");
+	return [...crypto.getRandomValues(new Uint8Array(16))].map((byte) => byte.toString(16).padStart(2, "0")).join("");
 }

@@ -18,161 +18,161 @@ const WAIT_MS = 250;
  *   `editing` is the camera as it was read, null for a new one
  */
 export function CameraForm({ editing, onSaved, onCancel }) {
-  const [base, setBase] = useState(editing);
-  const [fields, setFields] = useState(/** @type {Fields} */ (editing ? fieldsOf(editing) : BLANK));
-  const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
-  const [told, setTold] = useState(/** @type {string[]} */ ([]));
-  const [theirs, setTheirs] = useState(/** @type {any | null} */ (null));
-  const [isSaving, setIsSaving] = useState(false);
-  const { preview, faults: previewFaults } = usePreview(fields);
-  const title = useRef(/** @type {HTMLHeadingElement | null} */ (null));
-  const faults = [...previewFaults, ...(problem?.errors ?? [])];
-  const missing = missingOf(fields);
+	const [base, setBase] = useState(editing);
+	const [fields, setFields] = useState(/** @type {Fields} */ (editing ? fieldsOf(editing) : BLANK));
+	const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
+	const [told, setTold] = useState(/** @type {string[]} */ ([]));
+	const [theirs, setTheirs] = useState(/** @type {any | null} */ (null));
+	const [isSaving, setIsSaving] = useState(false);
+	const { preview, faults: previewFaults } = usePreview(fields);
+	const title = useRef(/** @type {HTMLHeadingElement | null} */ (null));
+	const faults = [...previewFaults, ...(problem?.errors ?? [])];
+	const missing = missingOf(fields);
 
-  useEffect(() => title.current?.focus(), []);
+	useEffect(() => title.current?.focus(), []);
 
-  /** @param {Fields} changed */
-  function change(changed) {
-    setFields((before) => ({ ...before, ...changed }));
-    setProblem(null);
-  }
+	/** @param {Fields} changed */
+	function change(changed) {
+		setFields((before) => ({ ...before, ...changed }));
+		setProblem(null);
+	}
 
-  /** @param {number | null} revision that is replaced; null for a new camera */
-  async function save(revision) {
-    setIsSaving(true);
-    setProblem(null);
-    try {
-      const camera = await storeCamera(bodyOf(fields), revision);
-      onSaved(camera, `Camera ${camera.name} is stored as revision ${camera.revision}.`);
-    } catch (error) {
-      if (!(error instanceof Problem)) throw error;
-      if (error.status === 412) await showTheirs();
-      else setProblem(nameTaken(error));
-    } finally {
-      setIsSaving(false);
-    }
-  }
+	/** @param {number | null} revision that is replaced; null for a new camera */
+	async function save(revision) {
+		setIsSaving(true);
+		setProblem(null);
+		try {
+			const camera = await storeCamera(bodyOf(fields), revision);
+			onSaved(camera, `Camera ${camera.name} is stored as revision ${camera.revision}.`);
+		} catch (error) {
+			if (!(error instanceof Problem)) throw error;
+			if (error.status === 412) await showTheirs();
+			else setProblem(nameTaken(error));
+		} finally {
+			setIsSaving(false);
+		}
+	}
 
-  async function showTheirs() {
-    try {
-      setTheirs(await getJson(`cameras/${encodeURIComponent(base.name)}`));
-    } catch (error) {
-      setProblem(problemOf(error));
-    }
-  }
+	async function showTheirs() {
+		try {
+			setTheirs(await getJson(`cameras/${encodeURIComponent(base.name)}`));
+		} catch (error) {
+			setProblem(problemOf(error));
+		}
+	}
 
-  /** @param {Event} event */
-  async function fillFromPhotograph(event) {
-    const input = /** @type {HTMLInputElement} */ (event.target);
-    const file = input.files?.[0];
-    if (!file) return;
-    try {
-      const headers = { "Content-Type": mediaTypeOf(file) };
-      const draft = await getJson("cameras/from-photo", { method: "POST", headers, body: file });
-      setTold(draft.warnings);
-      setFields((before) => filledIn(before, draft));
-      setProblem(null);
-    } catch (error) {
-      setProblem(problemOf(error));
-    }
-    input.value = "";
-  }
+	/** @param {Event} event */
+	async function fillFromPhotograph(event) {
+		const input = /** @type {HTMLInputElement} */ (event.target);
+		const file = input.files?.[0];
+		if (!file) return;
+		try {
+			const headers = { "Content-Type": mediaTypeOf(file) };
+			const draft = await getJson("cameras/from-photo", { method: "POST", headers, body: file });
+			setTold(draft.warnings);
+			setFields((before) => filledIn(before, draft));
+			setProblem(null);
+		} catch (error) {
+			setProblem(problemOf(error));
+		}
+		input.value = "";
+	}
 
-  const field = (/** @type {string} */ path, /** @type {string} */ label, /** @type {any} */ more = {}) =>
-    html`<${Field} ...${{ path, label, ...more }} value=${fields[path] ?? ""} faults=${faults} onChange=${change} />`;
+	const field = (/** @type {string} */ path, /** @type {string} */ label, /** @type {any} */ more = {}) =>
+		html`<${Field} ...${{ path, label, ...more }} value=${fields[path] ?? ""} faults=${faults} onChange=${change} />`;
 
-  return html`
-    <form
-      class="card"
-      aria-labelledby="camera-form-title"
-      onSubmit=${(/** @type {Event} */ event) => {
-        event.preventDefault();
-        save(base?.revision ?? null);
-      }}
-    >
-      <div class="row ends">
-        <h3 id="camera-form-title" tabindex="-1" ref=${title}>${base ? `Edit ${base.name}` : "New camera"}</h3>
-        ${base && html`<span class="badge">revision ${base.revision}</span>`}
-      </div>
-      ${theirs &&
-      html`<${Conflict}
-        base=${base}
-        theirs=${theirs}
-        fields=${fields}
-        onMine=${() => {
-          setTheirs(null);
-          setBase(theirs);
-          save(theirs.revision);
-        }}
-        onTheirs=${() => {
-          setTheirs(null);
-          setBase(theirs);
-          setFields(fieldsOf(theirs));
-        }}
-      />`}
-      <${ProblemBox} problem=${problem} />
-      <label class="field">
-        Fill in from a photograph it took
-        <input type="file" accept=${PHOTOGRAPHS} onChange=${fillFromPhotograph} />
-        <span class="hint">Its EXIF tells lens and sensor. The photograph is not kept.</span>
-      </label>
-      ${told.length > 0 && html`<ul class="notice plain" role="status">${told.map((words) => html`<li>${words}</li>`)}</ul>`}
-      <div class="pair">
-        ${field("name", "Name", { disabled: base !== null, kind: "text", hint: "letters, digits, dots, dashes" })}
-        ${field("focus_distance_m", "Focus distance (m)", { hint: "from the lens to what is sharp" })}
-        ${field("image_width_px", "Image width (px)", { hint: "of the photographs you will send" })}
-        ${field("image_height_px", "Image height (px)")}
-      </div>
-      <fieldset class="row">
-        <legend>Its blur is known by</legend>
-        ${[
-          ["lens", "lens specs"],
-          ["k_cam", "k_cam"],
-        ].map(
-          ([value, words]) => html`<label class="choice">
-            <input type="radio" name="by" value=${value} checked=${fields.by === value} onChange=${() => change({ by: value })} />
-            ${words}
-          </label>`,
-        )}
-      </fieldset>
-      ${fields.by === "lens"
-        ? html`<div class="pair">
-            ${field("lens/focal_length_mm", "Focal length (mm)", { hint: "the real one, never the 35-mm equivalent" })}
-            ${field("lens/f_number", "f-number")}
-            ${field("lens/pixel_pitch_um", "Pixel pitch (µm)", { hint: "of one sensor pixel" })}
-            ${field("lens/sensor_width_px", "Sensor width (px)", { hint: "of the whole sensor, along the image width" })}
-          </div>`
-        : html`<div class="pair">
-            ${field("k_cam_px", "k_cam (px)", { hint: "blur per unit of relative defocus, at the image width" })}
-          </div>`}
-      <details>
-        <summary>More: gamma, intrinsics, description</summary>
-        <div class="pair">
-          ${field("gamma_px", "gamma (px)", { hint: "blur of a point in perfect focus" })}
-          ${fields.by === "lens" && field("lens/k_r", "k_r", { hint: "circle of confusion over its deviation; a disc has 4" })}
-          ${field("intrinsics/fx_px", "fx (px)")} ${field("intrinsics/fy_px", "fy (px)")}
-          ${field("intrinsics/cx_px", "cx (px)")} ${field("intrinsics/cy_px", "cy (px)")}
-          ${field("intrinsics/distortion", "Distortion", { kind: "text", hint: "0, 4, 5, 8, 12 or 14 numbers in OpenCV's order" })}
-          ${field("description", "Description", { kind: "text" })}
-        </div>
-      </details>
-      ${base?.source === "calibration" &&
-      html`<p class="hint">Saved by hand it counts as given; what was calibrated stays as revision ${base.revision}.</p>`}
-      <div class="row">
-        <button class="primary" disabled=${isSaving}>${base ? "Save as a new revision" : "Create camera"}</button>
-        <button type="button" onClick=${onCancel}>Cancel</button>
-      </div>
-      <section class="stack live" aria-label="What these numbers come to" aria-live="polite">
-        ${preview
-          ? html`<${CameraCurve} camera=${preview} points=${preview.points} />`
-          : html`<p class="hint">
-              ${missing.length > 0
-                ? `Fill in ${missing.join(", ")} to see what the camera can measure.`
-                : (faults[0]?.detail ?? "Working it out ...")}
-            </p>`}
-      </section>
-    </form>
-  `;
+	return html`
+		<form
+			class="card"
+			aria-labelledby="camera-form-title"
+			onSubmit=${(/** @type {Event} */ event) => {
+				event.preventDefault();
+				save(base?.revision ?? null);
+			}}
+		>
+			<div class="row ends">
+				<h3 id="camera-form-title" tabindex="-1" ref=${title}>${base ? `Edit ${base.name}` : "New camera"}</h3>
+				${base && html`<span class="badge">revision ${base.revision}</span>`}
+			</div>
+			${theirs &&
+			html`<${Conflict}
+				base=${base}
+				theirs=${theirs}
+				fields=${fields}
+				onMine=${() => {
+					setTheirs(null);
+					setBase(theirs);
+					save(theirs.revision);
+				}}
+				onTheirs=${() => {
+					setTheirs(null);
+					setBase(theirs);
+					setFields(fieldsOf(theirs));
+				}}
+			/>`}
+			<${ProblemBox} problem=${problem} />
+			<label class="field">
+				Fill in from a photograph it took
+				<input type="file" accept=${PHOTOGRAPHS} onChange=${fillFromPhotograph} />
+				<span class="hint">Its EXIF tells lens and sensor. The photograph is not kept.</span>
+			</label>
+			${told.length > 0 && html`<ul class="notice plain" role="status">${told.map((words) => html`<li>${words}</li>`)}</ul>`}
+			<div class="pair">
+				${field("name", "Name", { disabled: base !== null, kind: "text", hint: "letters, digits, dots, dashes" })}
+				${field("focus_distance_m", "Focus distance (m)", { hint: "from the lens to what is sharp" })}
+				${field("image_width_px", "Image width (px)", { hint: "of the photographs you will send" })}
+				${field("image_height_px", "Image height (px)")}
+			</div>
+			<fieldset class="row">
+				<legend>Its blur is known by</legend>
+				${[
+					["lens", "lens specs"],
+					["k_cam", "k_cam"],
+				].map(
+					([value, words]) => html`<label class="choice">
+						<input type="radio" name="by" value=${value} checked=${fields.by === value} onChange=${() => change({ by: value })} />
+						${words}
+					</label>`,
+				)}
+			</fieldset>
+			${fields.by === "lens"
+				? html`<div class="pair">
+						${field("lens/focal_length_mm", "Focal length (mm)", { hint: "the real one, never the 35-mm equivalent" })}
+						${field("lens/f_number", "f-number")}
+						${field("lens/pixel_pitch_um", "Pixel pitch (µm)", { hint: "of one sensor pixel" })}
+						${field("lens/sensor_width_px", "Sensor width (px)", { hint: "of the whole sensor, along the image width" })}
+					</div>`
+				: html`<div class="pair">
+						${field("k_cam_px", "k_cam (px)", { hint: "blur per unit of relative defocus, at the image width" })}
+					</div>`}
+			<details>
+				<summary>More: gamma, intrinsics, description</summary>
+				<div class="pair">
+					${field("gamma_px", "gamma (px)", { hint: "blur of a point in perfect focus" })}
+					${fields.by === "lens" && field("lens/k_r", "k_r", { hint: "circle of confusion over its deviation; a disc has 4" })}
+					${field("intrinsics/fx_px", "fx (px)")} ${field("intrinsics/fy_px", "fy (px)")}
+					${field("intrinsics/cx_px", "cx (px)")} ${field("intrinsics/cy_px", "cy (px)")}
+					${field("intrinsics/distortion", "Distortion", { kind: "text", hint: "0, 4, 5, 8, 12 or 14 numbers in OpenCV's order" })}
+					${field("description", "Description", { kind: "text" })}
+				</div>
+			</details>
+			${base?.source === "calibration" &&
+			html`<p class="hint">Saved by hand it counts as given; what was calibrated stays as revision ${base.revision}.</p>`}
+			<div class="row">
+				<button class="primary" disabled=${isSaving}>${base ? "Save as a new revision" : "Create camera"}</button>
+				<button type="button" onClick=${onCancel}>Cancel</button>
+			</div>
+			<section class="stack live" aria-label="What these numbers come to" aria-live="polite">
+				${preview
+					? html`<${CameraCurve} camera=${preview} points=${preview.points} />`
+					: html`<p class="hint">
+							${missing.length > 0
+								? `Fill in ${missing.join(", ")} to see what the camera can measure.`
+								: (faults[0]?.detail ?? "Working it out ...")}
+						</p>`}
+			</section>
+		</form>
+	`;
 }
 
 /**
@@ -180,11 +180,11 @@ export function CameraForm({ editing, onSaved, onCancel }) {
  *   faults: import("./api.js").FieldProblem[], onChange: (changed: Fields) => void}} props
  */
 function Field({ path, label, value, kind = "decimal", hint, disabled = false, faults, onChange }) {
-  const fault = faults.find(({ pointer }) => pointer === `#/${path}` || pointer.startsWith(`#/${path}/`))?.detail;
-  return html`<${TextField}
-    ...${{ id: `camera-${path.replace("/", "-")}`, label, value, kind, fault, hint, disabled }}
-    onInput=${(/** @type {string} */ text) => onChange({ [path]: text })}
-  />`;
+	const fault = faults.find(({ pointer }) => pointer === `#/${path}` || pointer.startsWith(`#/${path}/`))?.detail;
+	return html`<${TextField}
+		...${{ id: `camera-${path.replace("/", "-")}`, label, value, kind, fault, hint, disabled }}
+		onInput=${(/** @type {string} */ text) => onChange({ [path]: text })}
+	/>`;
 }
 
 /**
@@ -193,31 +193,31 @@ function Field({ path, label, value, kind = "decimal", hint, disabled = false, f
  * @param {{base: any, theirs: any, fields: Fields, onMine: () => void, onTheirs: () => void}} props
  */
 function Conflict({ base, theirs, fields, onMine, onTheirs }) {
-  const changed = differences(base, theirs);
-  return html`
-    <div class="notice" role="alert">
-      <p>
-        <strong>${base.name} was changed while you edited it.</strong> You opened revision ${base.revision}; now it is at
-        revision ${theirs.revision}. Nothing of yours is stored yet.
-      </p>
-      ${changed.length > 0
-        ? html`<${Table} label="What changed" head=${["Field", "You opened", "Now stored", "Yours"]}>
-            ${changed.map(
-              ({ path, before, after }) => html`<tr>
-                <th scope="row">${path.replace("/", " ")}</th>
-                <td>${before || "–"}</td>
-                <td>${after || "–"}</td>
-                <td>${fields[path] || "–"}</td>
-              </tr>`,
-            )}
-          <//>`
-        : html`<p>Its numbers are the same as those you opened.</p>`}
-      <div class="row">
-        <button type="button" onClick=${onMine}>Store mine as revision ${theirs.revision + 1}</button>
-        <button type="button" onClick=${onTheirs}>Take what is stored</button>
-      </div>
-    </div>
-  `;
+	const changed = differences(base, theirs);
+	return html`
+		<div class="notice" role="alert">
+			<p>
+				<strong>${base.name} was changed while you edited it.</strong> You opened revision ${base.revision}; now it is at
+				revision ${theirs.revision}. Nothing of yours is stored yet.
+			</p>
+			${changed.length > 0
+				? html`<${Table} label="What changed" head=${["Field", "You opened", "Now stored", "Yours"]}>
+						${changed.map(
+							({ path, before, after }) => html`<tr>
+								<th scope="row">${path.replace("/", " ")}</th>
+								<td>${before || "–"}</td>
+								<td>${after || "–"}</td>
+								<td>${fields[path] || "–"}</td>
+							</tr>`,
+						)}
+					<//>`
+				: html`<p>Its numbers are the same as those you opened.</p>`}
+			<div class="row">
+				<button type="button" onClick=${onMine}>Store mine as revision ${theirs.revision + 1}</button>
+				<button type="button" onClick=${onTheirs}>Take what is stored</button>
+			</div>
+		</div>
+	`;
 }
 
 /**
@@ -227,35 +227,35 @@ function Conflict({ base, theirs, fields, onMine, onTheirs }) {
  * @returns {{preview: any | null, faults: import("./api.js").FieldProblem[]}}
  */
 function usePreview(fields) {
-  const [seen, setSeen] = useState({ preview: /** @type {any} */ (null), faults: /** @type {any[]} */ ([]) });
-  const { name: _, description: __, ...numbers } = bodyOf(fields);
-  const body = missingOf(fields).length > 0 ? null : JSON.stringify(numbers);
-  useEffect(() => {
-    if (body === null) {
-      setSeen({ preview: null, faults: [] });
-      return undefined;
-    }
-    const stop = new AbortController();
-    const timer = setTimeout(async () => {
-      try {
-        const preview = await sendJson("cameras/preview", JSON.parse(body), { signal: stop.signal, asks: false });
-        setSeen({ preview, faults: [] });
-      } catch (error) {
-        if (stop.signal.aborted) return;
-        const { errors, detail } = problemOf(error);
-        setSeen({ preview: null, faults: errors.length ? errors : [{ pointer: "", detail }] });
-      }
-    }, WAIT_MS);
-    return () => {
-      clearTimeout(timer);
-      stop.abort();
-    };
-  }, [body]);
-  return seen;
+	const [seen, setSeen] = useState({ preview: /** @type {any} */ (null), faults: /** @type {any[]} */ ([]) });
+	const { name: _, description: __, ...numbers } = bodyOf(fields);
+	const body = missingOf(fields).length > 0 ? null : JSON.stringify(numbers);
+	useEffect(() => {
+		if (body === null) {
+			setSeen({ preview: null, faults: [] });
+			return undefined;
+		}
+		const stop = new AbortController();
+		const timer = setTimeout(async () => {
+			try {
+				const preview = await sendJson("cameras/preview", JSON.parse(body), { signal: stop.signal, asks: false });
+				setSeen({ preview, faults: [] });
+			} catch (error) {
+				if (stop.signal.aborted) return;
+				const { errors, detail } = problemOf(error);
+				setSeen({ preview: null, faults: errors.length ? errors : [{ pointer: "", detail }] });
+			}
+		}, WAIT_MS);
+		return () => {
+			clearTimeout(timer);
+			stop.abort();
+		};
+	}, [body]);
+	return seen;
 }
 
 /** @param {Problem} problem @returns {Problem} with the name marked, where it is taken */
 function nameTaken(problem) {
-  if (problem.status === 409) problem.errors = [{ pointer: "#/name", detail: "This name is taken." }];
-  return problem;
+	if (problem.status === 409) problem.errors = [{ pointer: "#/name", detail: "This name is taken." }];
+	return problem;
 }

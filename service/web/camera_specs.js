@@ -8,51 +8,44 @@ const SIZE = ["image_width_px", "image_height_px"];
 const LENS = ["focal_length_mm", "f_number", "pixel_pitch_um", "sensor_width_px", "k_r"];
 const PINHOLE = ["fx_px", "fy_px", "cx_px", "cy_px"];
 const NEEDED = {
-  "image_width_px": "image width",
-  "image_height_px": "image height",
-  "focus_distance_m": "focus distance",
+	"image_width_px": "image width",
+	"image_height_px": "image height",
+	"focus_distance_m": "focus distance",
 };
 const NEEDED_OF_LENS = {
-  "lens/focal_length_mm": "focal length",
-  "lens/f_number": "f-number",
-  "lens/pixel_pitch_um": "pixel pitch",
-  "lens/sensor_width_px": "sensor width",
+	"lens/focal_length_mm": "focal length",
+	"lens/f_number": "f-number",
+	"lens/pixel_pitch_um": "pixel pitch",
+	"lens/sensor_width_px": "sensor width",
 };
 
 /** The fields of a camera that is not there yet. @type {Fields} */
 export const BLANK = { "by": "lens", "gamma_px": "0.5", "lens/k_r": "4" };
 
-/**
- * What `POST /cameras` takes, of a camera that the API answered.
- *
- * @param {any} camera
- */
+/** What `POST /cameras` takes, of a camera that the API answered. @param {any} camera */
 export function specsOf(camera) {
-  const { name, image_width_px, image_height_px, focus_distance_m, k_cam_px, gamma_px, lens } = camera;
-  const { intrinsics = null, description = null } = camera;
-  const blur = lens ? { lens } : { k_cam_px };
-  return { name, description, image_width_px, image_height_px, focus_distance_m, ...blur, gamma_px, intrinsics };
+	const { name, image_width_px, image_height_px, focus_distance_m, k_cam_px, gamma_px, lens } = camera;
+	const { intrinsics = null, description = null } = camera;
+	const blur = lens ? { lens } : { k_cam_px };
+	return { name, description, image_width_px, image_height_px, focus_distance_m, ...blur, gamma_px, intrinsics };
 }
 
-/**
- * @param {any} camera as the API answers or takes it; what is null stays empty
- * @returns {Fields}
- */
+/** @param {any} camera as the API answers or takes it; what is null stays empty @returns {Fields} */
 export function fieldsOf(camera) {
-  /** @type {Fields} */
-  const fields = { ...BLANK, by: camera.lens ? "lens" : "k_cam" };
-  const fill = (/** @type {string} */ path, /** @type {unknown} */ value) => {
-    if (value !== null && value !== undefined) fields[path] = String(value);
-  };
-  const plain = ["name", "description", "image_width_px", "image_height_px", "focus_distance_m", "gamma_px"];
-  for (const name of plain) fill(name, camera[name]);
-  if (camera.lens) for (const name of LENS) fill(`lens/${name}`, camera.lens[name]);
-  else fill("k_cam_px", camera.k_cam_px);
-  if (camera.intrinsics) {
-    for (const name of PINHOLE) fill(`intrinsics/${name}`, camera.intrinsics[name]);
-    fill("intrinsics/distortion", (camera.intrinsics.distortion ?? []).join(", "));
-  }
-  return fields;
+	/** @type {Fields} */
+	const fields = { ...BLANK, by: camera.lens ? "lens" : "k_cam" };
+	const fill = (/** @type {string} */ path, /** @type {unknown} */ value) => {
+		if (value !== null && value !== undefined) fields[path] = String(value);
+	};
+	const plain = ["name", "description", "image_width_px", "image_height_px", "focus_distance_m", "gamma_px"];
+	for (const name of plain) fill(name, camera[name]);
+	if (camera.lens) for (const name of LENS) fill(`lens/${name}`, camera.lens[name]);
+	else fill("k_cam_px", camera.k_cam_px);
+	if (camera.intrinsics) {
+		for (const name of PINHOLE) fill(`intrinsics/${name}`, camera.intrinsics[name]);
+		fill("intrinsics/distortion", (camera.intrinsics.distortion ?? []).join(", "));
+	}
+	return fields;
 }
 
 /**
@@ -64,44 +57,38 @@ export function fieldsOf(camera) {
  * @returns {Fields}
  */
 export function filledIn(before, draft) {
-  const told = fieldsOf({ ...draft, name: before.name || draft.name });
-  const isAnotherSize = SIZE.some((name) => before[name] && before[name] !== told[name]);
-  const kept = Object.entries(before).filter(([path]) => !(isAnotherSize && path.startsWith("intrinsics/")));
-  const { gamma_px, "lens/k_r": k_r } = { ...BLANK, ...before };
-  return { ...Object.fromEntries(kept), ...told, gamma_px, "lens/k_r": k_r, by: "lens" };
+	const told = fieldsOf({ ...draft, name: before.name || draft.name });
+	const isAnotherSize = SIZE.some((name) => before[name] && before[name] !== told[name]);
+	const kept = Object.entries(before).filter(([path]) => !(isAnotherSize && path.startsWith("intrinsics/")));
+	const { gamma_px, "lens/k_r": k_r } = { ...BLANK, ...before };
+	return { ...Object.fromEntries(kept), ...told, gamma_px, "lens/k_r": k_r, by: "lens" };
 }
 
-/**
- * @param {Fields} fields
- * @returns {any} the body for the API, which says itself what is no number
- */
+/** @param {Fields} fields @returns {any} the body for the API, which says itself what is no number */
 export function bodyOf(fields) {
-  const text = (/** @type {string} */ path) => (fields[path] ?? "").trim();
-  const number = (/** @type {string} */ path) => toNumber(text(path));
-  /** @type {any} */
-  const body = { name: text("name") || null, description: text("description") || null };
-  for (const path of [...Object.keys(NEEDED), "gamma_px"]) if (text(path)) body[path] = number(path);
-  if (fields.by === "lens") {
-    body.lens = Object.fromEntries(LENS.filter((name) => text(`lens/${name}`)).map((name) => [name, number(`lens/${name}`)]));
-  } else if (text("k_cam_px")) {
-    body.k_cam_px = number("k_cam_px");
-  }
-  const pinhole = PINHOLE.filter((name) => text(`intrinsics/${name}`));
-  const distortion = text("intrinsics/distortion");
-  if (pinhole.length > 0 || distortion) {
-    body.intrinsics = Object.fromEntries(pinhole.map((name) => [name, number(`intrinsics/${name}`)]));
-    body.intrinsics.distortion = distortion.split(/[\s,]+/).filter(Boolean).map(toNumber);
-  }
-  return body;
+	const text = (/** @type {string} */ path) => (fields[path] ?? "").trim();
+	const number = (/** @type {string} */ path) => toNumber(text(path));
+	/** @type {any} */
+	const body = { name: text("name") || null, description: text("description") || null };
+	for (const path of [...Object.keys(NEEDED), "gamma_px"]) if (text(path)) body[path] = number(path);
+	if (fields.by === "lens") {
+		body.lens = Object.fromEntries(LENS.filter((name) => text(`lens/${name}`)).map((name) => [name, number(`lens/${name}`)]));
+	} else if (text("k_cam_px")) {
+		body.k_cam_px = number("k_cam_px");
+	}
+	const pinhole = PINHOLE.filter((name) => text(`intrinsics/${name}`));
+	const distortion = text("intrinsics/distortion");
+	if (pinhole.length > 0 || distortion) {
+		body.intrinsics = Object.fromEntries(pinhole.map((name) => [name, number(`intrinsics/${name}`)]));
+		body.intrinsics.distortion = distortion.split(/[\s,]+/).filter(Boolean).map(toNumber);
+	}
+	return body;
 }
 
-/**
- * @param {Fields} fields
- * @returns {string[]} the names of what must be filled in before anything can be said of the camera
- */
+/** @param {Fields} fields @returns {string[]} the names of what must be filled in before anything can be said of the camera */
 export function missingOf(fields) {
-  const needed = { ...NEEDED, ...(fields.by === "lens" ? NEEDED_OF_LENS : { "k_cam_px": "k_cam" }) };
-  return Object.entries(needed).flatMap(([path, words]) => ((fields[path] ?? "").trim() ? [] : [words]));
+	const needed = { ...NEEDED, ...(fields.by === "lens" ? NEEDED_OF_LENS : { "k_cam_px": "k_cam" }) };
+	return Object.entries(needed).flatMap(([path, words]) => ((fields[path] ?? "").trim() ? [] : [words]));
 }
 
 /**
@@ -112,15 +99,15 @@ export function missingOf(fields) {
  * @returns {{path: string, before: string, after: string}[]}
  */
 export function differences(before, after) {
-  const [from, to] = [fieldsOf(specsOf(before)), fieldsOf(specsOf(after))];
-  const paths = [...new Set([...Object.keys(from), ...Object.keys(to)])].filter((path) => path !== "by");
-  return paths
-    .filter((path) => (from[path] ?? "") !== (to[path] ?? ""))
-    .map((path) => ({ path, before: from[path] ?? "", after: to[path] ?? "" }));
+	const [from, to] = [fieldsOf(specsOf(before)), fieldsOf(specsOf(after))];
+	const paths = [...new Set([...Object.keys(from), ...Object.keys(to)])].filter((path) => path !== "by");
+	return paths
+		.filter((path) => (from[path] ?? "") !== (to[path] ?? ""))
+		.map((path) => ({ path, before: from[path] ?? "", after: to[path] ?? "" }));
 }
 
 /** @param {string} text */
 function toNumber(text) {
-  const value = decimal(text);
-  return Number.isNaN(value) ? text : value;
+	const value = decimal(text);
+	return Number.isNaN(value) ? text : value;
 }

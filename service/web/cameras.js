@@ -17,123 +17,123 @@ const SOURCES = { given: "given", lens: "from lens specs", calibration: "calibra
 
 /** @param {import("./app.js").ViewProps} props */
 export function CamerasView({ shown, cameras, camera, reloadCameras, go, announce }) {
-  const [open, setOpen] = useState(/** @type {Open} */ ({ kind: "none" }));
-  const [file, setFile] = useState(/** @type {File | null} */ (null));
-  const [filter, setFilter] = useState("");
-  const [most, setMost] = useState(A_PAGE);
-  const importing = useRef(/** @type {HTMLInputElement | null} */ (null));
-  const found = useMemo(
-    () => (cameras ?? []).filter(({ name }) => name.toLowerCase().includes(filter.toLowerCase())),
-    [cameras, filter],
-  );
-  const read = open.kind === "read" ? cameras?.find(({ name }) => name === open.name) : null;
+	const [open, setOpen] = useState(/** @type {Open} */ ({ kind: "none" }));
+	const [file, setFile] = useState(/** @type {File | null} */ (null));
+	const [filter, setFilter] = useState("");
+	const [most, setMost] = useState(A_PAGE);
+	const importing = useRef(/** @type {HTMLInputElement | null} */ (null));
+	const found = useMemo(
+		() => (cameras ?? []).filter(({ name }) => name.toLowerCase().includes(filter.toLowerCase())),
+		[cameras, filter],
+	);
+	const read = open.kind === "read" ? cameras?.find(({ name }) => name === open.name) : null;
 
-  useEffect(() => {
-    if (shown && camera) setOpen({ kind: "read", name: camera });
-  }, [shown, camera]);
+	useEffect(() => {
+		if (shown && camera) setOpen({ kind: "read", name: camera });
+	}, [shown, camera]);
 
-  /** @param {string | null} name of the camera to show then @param {string} words */
-  async function changed(name, words) {
-    await reloadCameras();
-    setOpen(name ? { kind: "read", name } : { kind: "none" });
-    announce(words);
-  }
+	/** @param {string | null} name of the camera to show then @param {string} words */
+	async function changed(name, words) {
+		await reloadCameras();
+		setOpen(name ? { kind: "read", name } : { kind: "none" });
+		announce(words);
+	}
 
-  return html`
-    <div class="stack">
-      <div class="row ends">
-        <h2>Cameras</h2>
-        <div class="row">
-          <button type="button" class="primary" onClick=${() => setOpen({ kind: "new" })}>New camera</button>
-          <button type="button" onClick=${() => importing.current?.click()}>Import</button>
-          <button type="button" disabled=${!cameras?.length} onClick=${() => exportCameras(cameras ?? [], "cameras")}>
-            Export all
-          </button>
-          <input
-            ref=${importing}
-            type="file"
-            accept=".json,application/json"
-            hidden
-            aria-label="Cameras to import"
-            onChange=${(/** @type {Event} */ event) => {
-              const input = /** @type {HTMLInputElement} */ (event.target);
-              setFile(input.files?.[0] ?? null);
-              input.value = "";
-            }}
-          />
-        </div>
-      </div>
-      <div class="cameras">
-        <section class="card" aria-label="List of cameras">
-          ${cameras === null && html`<p class="hint">Loading ...</p>`}
-          ${cameras?.length === 0 &&
-          html`<p>There is no camera yet. Make one from its lens specs, or <a href="#calibrate">measure it</a> with a printed sheet.</p>`}
-          ${(filter || (cameras?.length ?? 0) > A_PAGE / 2) &&
-          html`<label class="field">
-            Find
-            <input
-              type="search"
-              value=${filter}
-              onInput=${(/** @type {any} */ event) =>
-                setFilter(event.target.value)}
-            />
-          </label>`}
-          ${found.length > 0 &&
-          html`<ul class="camera-list">
-            ${found.slice(0, most).map(
-              (one) => html`<li key=${one.name}>
-                <button
-                  type="button"
-                  aria-pressed=${open.kind === "read" && open.name === one.name}
-                  onClick=${() => setOpen({ kind: "read", name: one.name })}
-                >
-                  <span class="name">${one.name}</span>
-                  <span class="hint">
-                    ${`k_cam ${short(one.k_cam_px)} px, focus ${short(one.focus_distance_m)} m, ${one.image_width_px}×${one.image_height_px}`}
-                  </span>
-                  <span class="badge">${SOURCES[one.source]}</span>
-                </button>
-              </li>`,
-            )}
-          </ul>`}
-          ${found.length > most &&
-          html`<button type="button" onClick=${() => setMost(most + A_PAGE)}>
-            Show more (${found.length - most} left)
-          </button>`}
-        </section>
-        <div class="stack">
-          ${open.kind === "none" &&
-          cameras !== null &&
-          cameras.length > 0 &&
-          html`<p class="hint">Choose a camera to see what it can measure.</p>`}
-          ${(open.kind === "new" || open.kind === "edit") &&
-          html`<${CameraForm}
-            key=${open.kind === "edit" ? open.camera.name : ""}
-            editing=${open.kind === "edit" ? open.camera : null}
-            onSaved=${(/** @type {any} */ stored, /** @type {string} */ words) => changed(stored.name, words)}
-            onCancel=${() => setOpen(open.kind === "edit" ? { kind: "read", name: open.camera.name } : { kind: "none" })}
-          />`}
-          ${read &&
-          html`<${CameraCard}
-            key=${`${read.name} ${read.revision}`}
-            camera=${read}
-            go=${go}
-            onEdit=${() => setOpen({ kind: "edit", camera: read })}
-            onDeleted=${() => changed(null, `Camera ${read.name} is deleted.`)}
-            onStale=${reloadCameras}
-          />`}
-        </div>
-      </div>
-      ${file &&
-      html`<${ImportDialog}
-        file=${file}
-        onClose=${(/** @type {number} */ stored) => {
-          setFile(null);
-          if (stored > 0) changed(null, `${counted(stored, "camera is", "cameras are")} imported.`);
-        }}
-      />`}
-    </div>
-  `;
+	return html`
+		<div class="stack">
+			<div class="row ends">
+				<h2>Cameras</h2>
+				<div class="row">
+					<button type="button" class="primary" onClick=${() => setOpen({ kind: "new" })}>New camera</button>
+					<button type="button" onClick=${() => importing.current?.click()}>Import</button>
+					<button type="button" disabled=${!cameras?.length} onClick=${() => exportCameras(cameras ?? [], "cameras")}>
+						Export all
+					</button>
+					<input
+						ref=${importing}
+						type="file"
+						accept=".json,application/json"
+						hidden
+						aria-label="Cameras to import"
+						onChange=${(/** @type {Event} */ event) => {
+							const input = /** @type {HTMLInputElement} */ (event.target);
+							setFile(input.files?.[0] ?? null);
+							input.value = "";
+						}}
+					/>
+				</div>
+			</div>
+			<div class="cameras">
+				<section class="card" aria-label="List of cameras">
+					${cameras === null && html`<p class="hint">Loading ...</p>`}
+					${cameras?.length === 0 &&
+					html`<p>There is no camera yet. Make one from its lens specs, or <a href="#calibrate">measure it</a> with a printed sheet.</p>`}
+					${(filter || (cameras?.length ?? 0) > A_PAGE / 2) &&
+					html`<label class="field">
+						Find
+						<input
+							type="search"
+							value=${filter}
+							onInput=${(/** @type {any} */ event) =>
+								setFilter(event.target.value)}
+						/>
+					</label>`}
+					${found.length > 0 &&
+					html`<ul class="camera-list">
+						${found.slice(0, most).map(
+							(one) => html`<li key=${one.name}>
+								<button
+									type="button"
+									aria-pressed=${open.kind === "read" && open.name === one.name}
+									onClick=${() => setOpen({ kind: "read", name: one.name })}
+								>
+									<span class="name">${one.name}</span>
+									<span class="hint">
+										${`k_cam ${short(one.k_cam_px)} px, focus ${short(one.focus_distance_m)} m, ${one.image_width_px}×${one.image_height_px}`}
+									</span>
+									<span class="badge">${SOURCES[one.source]}</span>
+								</button>
+							</li>`,
+						)}
+					</ul>`}
+					${found.length > most &&
+					html`<button type="button" onClick=${() => setMost(most + A_PAGE)}>
+						Show more (${found.length - most} left)
+					</button>`}
+				</section>
+				<div class="stack">
+					${open.kind === "none" &&
+					cameras !== null &&
+					cameras.length > 0 &&
+					html`<p class="hint">Choose a camera to see what it can measure.</p>`}
+					${(open.kind === "new" || open.kind === "edit") &&
+					html`<${CameraForm}
+						key=${open.kind === "edit" ? open.camera.name : ""}
+						editing=${open.kind === "edit" ? open.camera : null}
+						onSaved=${(/** @type {any} */ stored, /** @type {string} */ words) => changed(stored.name, words)}
+						onCancel=${() => setOpen(open.kind === "edit" ? { kind: "read", name: open.camera.name } : { kind: "none" })}
+					/>`}
+					${read &&
+					html`<${CameraCard}
+						key=${`${read.name} ${read.revision}`}
+						camera=${read}
+						go=${go}
+						onEdit=${() => setOpen({ kind: "edit", camera: read })}
+						onDeleted=${() => changed(null, `Camera ${read.name} is deleted.`)}
+						onStale=${reloadCameras}
+					/>`}
+				</div>
+			</div>
+			${file &&
+			html`<${ImportDialog}
+				file=${file}
+				onClose=${(/** @type {number} */ stored) => {
+					setFile(null);
+					if (stored > 0) changed(null, `${counted(stored, "camera is", "cameras are")} imported.`);
+				}}
+			/>`}
+		</div>
+	`;
 }
 
 /**
@@ -141,145 +141,143 @@ export function CamerasView({ shown, cameras, camera, reloadCameras, go, announc
  *   onStale: () => void}} props `onStale` is for when the service has another revision
  */
 function CameraCard({ camera, go, onEdit, onDeleted, onStale }) {
-  const path = `cameras/${encodeURIComponent(camera.name)}`;
-  const { answer: curve, problem } = useAnswer(`${path}/curve`);
-  const [isDeleting, setIsDeleting] = useState(false);
-  const { lens, intrinsics } = camera;
-  return html`
-    <article class="card" aria-labelledby="camera-title">
-      <div class="row ends">
-        <h3 id="camera-title">${camera.name}</h3>
-        <span class="row">
-          <span class="badge">${SOURCES[camera.source]}</span>
-          <span class="badge">revision ${camera.revision}</span>
-        </span>
-      </div>
-      ${camera.description && html`<p>${camera.description}</p>`}
-      <div class="row">
-        <button type="button" class="primary" onClick=${() => go("depth", { camera: camera.name })}>Measure depth</button>
-        <button type="button" onClick=${onEdit}>Edit</button>
-        <button type="button" onClick=${() => go("calibrate", { camera: camera.name })}>Calibrate</button>
-        <button type="button" onClick=${() => exportCameras([camera], camera.name)}>Export</button>
-        <button type="button" class="danger" onClick=${() => setIsDeleting(true)}>Delete</button>
-      </div>
-      <${CameraCurve} camera=${camera} points=${curve?.points ?? null} />
-      <${ProblemBox} problem=${problem} />
-      <dl class="facts">
-        <dt>Image</dt><dd>${camera.image_width_px} × ${camera.image_height_px} px</dd>
-        <dt>Focus distance</dt><dd>${short(camera.focus_distance_m, 4)} m</dd>
-        <dt>gamma</dt><dd>${short(camera.gamma_px)} px</dd>
-        ${lens &&
-        html`<dt>Lens</dt>
-          <dd>${lens.focal_length_mm} mm f/${lens.f_number}, ${lens.pixel_pitch_um} µm pixels, sensor ${lens.sensor_width_px} px wide, k_r ${lens.k_r}</dd>`}
-        ${intrinsics &&
-        html`<dt>Intrinsics</dt>
-          <dd>
-            fx ${short(intrinsics.fx_px, 5)}, fy ${short(intrinsics.fy_px, 5)}, cx ${short(intrinsics.cx_px, 5)}, cy
-            ${short(intrinsics.cy_px, 5)}${intrinsics.distortion.length > 0 &&
-            `; distortion ${intrinsics.distortion.map((/** @type {number} */ term) => short(term)).join(", ")}`}
-          </dd>`}
-        <dt>Changed</dt><dd>${when(camera.updated_at)}</dd>
-      </dl>
-      <${Revisions} path=${`${path}/revisions`} />
-      ${isDeleting && html`<${DeleteDialog} camera=${camera} path=${path} onClose=${() => setIsDeleting(false)} ...${{ onDeleted, onStale }} />`}
-    </article>
-  `;
+	const path = `cameras/${encodeURIComponent(camera.name)}`;
+	const { answer: curve, problem } = useAnswer(`${path}/curve`);
+	const [isDeleting, setIsDeleting] = useState(false);
+	const { lens, intrinsics } = camera;
+	return html`
+		<article class="card" aria-labelledby="camera-title">
+			<div class="row ends">
+				<h3 id="camera-title">${camera.name}</h3>
+				<span class="row">
+					<span class="badge">${SOURCES[camera.source]}</span>
+					<span class="badge">revision ${camera.revision}</span>
+				</span>
+			</div>
+			${camera.description && html`<p>${camera.description}</p>`}
+			<div class="row">
+				<button type="button" class="primary" onClick=${() => go("depth", { camera: camera.name })}>Measure depth</button>
+				<button type="button" onClick=${onEdit}>Edit</button>
+				<button type="button" onClick=${() => go("calibrate", { camera: camera.name })}>Calibrate</button>
+				<button type="button" onClick=${() => exportCameras([camera], camera.name)}>Export</button>
+				<button type="button" class="danger" onClick=${() => setIsDeleting(true)}>Delete</button>
+			</div>
+			<${CameraCurve} camera=${camera} points=${curve?.points ?? null} />
+			<${ProblemBox} problem=${problem} />
+			<dl class="facts">
+				<dt>Image</dt><dd>${camera.image_width_px} × ${camera.image_height_px} px</dd>
+				<dt>Focus distance</dt><dd>${short(camera.focus_distance_m, 4)} m</dd>
+				<dt>gamma</dt><dd>${short(camera.gamma_px)} px</dd>
+				${lens &&
+				html`<dt>Lens</dt>
+					<dd>${lens.focal_length_mm} mm f/${lens.f_number}, ${lens.pixel_pitch_um} µm pixels, sensor ${lens.sensor_width_px} px wide, k_r ${lens.k_r}</dd>`}
+				${intrinsics &&
+				html`<dt>Intrinsics</dt>
+					<dd>
+						fx ${short(intrinsics.fx_px, 5)}, fy ${short(intrinsics.fy_px, 5)}, cx ${short(intrinsics.cx_px, 5)}, cy
+						${short(intrinsics.cy_px, 5)}${intrinsics.distortion.length > 0 &&
+						`; distortion ${intrinsics.distortion.map((/** @type {number} */ term) => short(term)).join(", ")}`}
+					</dd>`}
+				<dt>Changed</dt><dd>${when(camera.updated_at)}</dd>
+			</dl>
+			<${Revisions} path=${`${path}/revisions`} />
+			${isDeleting && html`<${DeleteDialog} camera=${camera} path=${path} onClose=${() => setIsDeleting(false)} ...${{ onDeleted, onStale }} />`}
+		</article>
+	`;
 }
 
 /** @param {{path: string}} props */
 function Revisions({ path }) {
-  const [items, setItems] = useState(/** @type {any[]} */ ([]));
-  const [cursor, setCursor] = useState(/** @type {string | null} */ (null));
-  const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
+	const [items, setItems] = useState(/** @type {any[]} */ ([]));
+	const [cursor, setCursor] = useState(/** @type {string | null} */ (null));
+	const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
 
-  /** @param {string | null} after */
-  async function load(after) {
-    setCursor(null); // until the next is known
-    try {
-      const page = await getJson(`${path}?limit=${A_PAGE}${after ? `&cursor=${encodeURIComponent(after)}` : ""}`);
-      setItems((before) => [...(after ? before : []), ...page.items]);
-      setCursor(page.next_cursor);
-      setProblem(null);
-    } catch (error) {
-      setProblem(problemOf(error));
-    }
-  }
+	/** @param {string | null} after */
+	async function load(after) {
+		setCursor(null); // until the next is known
+		try {
+			const page = await getJson(`${path}?limit=${A_PAGE}${after ? `&cursor=${encodeURIComponent(after)}` : ""}`);
+			setItems((before) => [...(after ? before : []), ...page.items]);
+			setCursor(page.next_cursor);
+			setProblem(null);
+		} catch (error) {
+			setProblem(problemOf(error));
+		}
+	}
 
-  return html`
-    <details
-      onToggle=${(/** @type {Event} */ event) => {
-        if (/** @type {HTMLDetailsElement} */ (event.target).open && items.length === 0) load(null);
-      }}
-    >
-      <summary>Revisions</summary>
-      <${ProblemBox} problem=${problem} onRetry=${() => load(null)} />
-      <ol class="revisions">
-        ${items.map(
-          (one, place) => html`<li key=${one.revision}>
-            <span class="row">
-              <span class="badge">${one.revision}</span> ${when(one.updated_at)}
-              <span class="hint">${SOURCES[one.source]}, k_cam ${short(one.k_cam_px, 4)} px</span>
-            </span>
-            ${items[place + 1] && html`<span class="hint">${changesOf(items[place + 1], one)}</span>`}
-          </li>`,
-        )}
-      </ol>
-      ${cursor && html`<button type="button" onClick=${() => load(cursor)}>Show earlier ones</button>`}
-    </details>
-  `;
+	return html`
+		<details
+			onToggle=${(/** @type {Event} */ event) => {
+				if (/** @type {HTMLDetailsElement} */ (event.target).open && items.length === 0) load(null);
+			}}
+		>
+			<summary>Revisions</summary>
+			<${ProblemBox} problem=${problem} onRetry=${() => load(null)} />
+			<ol class="revisions">
+				${items.map(
+					(one, place) => html`<li key=${one.revision}>
+						<span class="row">
+							<span class="badge">${one.revision}</span> ${when(one.updated_at)}
+							<span class="hint">${SOURCES[one.source]}, k_cam ${short(one.k_cam_px, 4)} px</span>
+						</span>
+						${items[place + 1] && html`<span class="hint">${changesOf(items[place + 1], one)}</span>`}
+					</li>`,
+				)}
+			</ol>
+			${cursor && html`<button type="button" onClick=${() => load(cursor)}>Show earlier ones</button>`}
+		</details>
+	`;
 }
 
 /** @param {any} before @param {any} after */
 function changesOf(before, after) {
-  const changed = differences(before, after);
-  if (changed.length === 0) return "the same numbers";
-  return changed.map((one) => `${one.path.replace("/", " ")} ${one.before || "–"} → ${one.after || "–"}`).join("; ");
+	const changed = differences(before, after);
+	if (changed.length === 0) return "the same numbers";
+	return changed.map((one) => `${one.path.replace("/", " ")} ${one.before || "–"} → ${one.after || "–"}`).join("; ");
 }
 
-/**
- * @param {{camera: any, path: string, onClose: () => void, onDeleted: () => void, onStale: () => void}} props
- */
+/** @param {{camera: any, path: string, onClose: () => void, onDeleted: () => void, onStale: () => void}} props */
 function DeleteDialog({ camera, path, onClose, onDeleted, onStale }) {
-  const dialog = useRef(/** @type {HTMLDialogElement | null} */ (null));
-  const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
-  useEffect(() => dialog.current?.showModal(), []);
+	const dialog = useRef(/** @type {HTMLDialogElement | null} */ (null));
+	const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
+	useEffect(() => dialog.current?.showModal(), []);
 
-  async function remove() {
-    try {
-      await request(path, { method: "DELETE", headers: { "If-Match": `"${camera.revision}"` } });
-    } catch (error) {
-      setProblem(problemOf(error));
-      return;
-    }
-    dialog.current?.close();
-    onDeleted();
-  }
+	async function remove() {
+		try {
+			await request(path, { method: "DELETE", headers: { "If-Match": `"${camera.revision}"` } });
+		} catch (error) {
+			setProblem(problemOf(error));
+			return;
+		}
+		dialog.current?.close();
+		onDeleted();
+	}
 
-  return html`
-    <dialog ref=${dialog} aria-labelledby="delete-title" onClose=${onClose}>
-      <div class="stack">
-        <h2 id="delete-title">Delete ${camera.name}?</h2>
-        <p>Photographs can no longer be sent with this camera. Its name is free again, and its revisions are kept.</p>
-        <${ProblemBox} problem=${problem} onRetry=${[404, 412].includes(problem?.status ?? 0) ? onStale : undefined} />
-        <div class="row">
-          <button type="button" class="danger" onClick=${remove}>Delete ${camera.name}</button>
-          <button type="button" onClick=${() => dialog.current?.close()}>Keep it</button>
-        </div>
-      </div>
-    </dialog>
-  `;
+	return html`
+		<dialog ref=${dialog} aria-labelledby="delete-title" onClose=${onClose}>
+			<div class="stack">
+				<h2 id="delete-title">Delete ${camera.name}?</h2>
+				<p>Photographs can no longer be sent with this camera. Its name is free again, and its revisions are kept.</p>
+				<${ProblemBox} problem=${problem} onRetry=${[404, 412].includes(problem?.status ?? 0) ? onStale : undefined} />
+				<div class="row">
+					<button type="button" class="danger" onClick=${remove}>Delete ${camera.name}</button>
+					<button type="button" onClick=${() => dialog.current?.close()}>Keep it</button>
+				</div>
+			</div>
+		</dialog>
+	`;
 }
 
 /** @param {string} path @returns {{answer: any | null, problem: Problem | null}} */
 function useAnswer(path) {
-  const [state, setState] = useState({ answer: /** @type {any} */ (null), problem: /** @type {Problem | null} */ (null) });
-  useEffect(() => {
-    const stop = new AbortController();
-    getJson(path, { signal: stop.signal }).then(
-      (answer) => setState({ answer, problem: null }),
-      (problem) => !stop.signal.aborted && setState({ answer: null, problem }),
-    );
-    return () => stop.abort();
-  }, [path]);
-  return state;
+	const [state, setState] = useState({ answer: /** @type {any} */ (null), problem: /** @type {Problem | null} */ (null) });
+	useEffect(() => {
+		const stop = new AbortController();
+		getJson(path, { signal: stop.signal }).then(
+			(answer) => setState({ answer, problem: null }),
+			(problem) => !stop.signal.aborted && setState({ answer: null, problem }),
+		);
+		return () => stop.abort();
+	}, [path]);
+	return state;
 }

@@ -24,144 +24,127 @@ const MOST_ROWS = 30;
 
 /** @typedef {{scale: (value: number) => number, ticks: number[]}} Scale */
 
-/**
- * @param {{title: string, x: Axis, y: Axis, series: Series[], marks?: {x: number, label: string}[]}} props
- *   `marks` are upright lines with a word
- */
+/** @param {{title: string, x: Axis, y: Axis, series: Series[], marks?: {x: number, label: string}[]}} props `marks` are upright lines with a word */
 export function Chart({ title, x, y, series, marks = [] }) {
-  const [box, width] = useWidth();
-  const points = series.flatMap((one) => one.points);
-  if (points.length === 0) return null;
-  const across = scaleOf(x, [...points.map((point) => point.x), ...marks.map((mark) => mark.x)], LEFT, width - RIGHT);
-  const heights = points.flatMap(({ y: at, low = at, high = at }) => [at, low, high]);
-  const up = scaleOf(y, heights, HEIGHT - BOTTOM, TOP);
-  const named = series.filter(({ name }) => name);
-  return html`
-    <figure class="chart" ref=${box}>
-      <figcaption class="row ends">
-        <span>${title}</span>
-        ${named.length > 1 &&
-        html`<span class="row hint" aria-hidden="true">
-          ${named.map((one) => html`<span class="row"><i class=${`key ${one.kind} ${one.tone}`}></i>${one.name}</span>`)}
-        </span>`}
-      </figcaption>
-      <svg role="img" aria-label=${title} viewBox=${`0 0 ${width} ${HEIGHT}`} width=${width} height=${HEIGHT}>
-        ${up.ticks.map(
-          (tick) => html`<g key=${tick}>
-            <line class="grid" x1=${LEFT} x2=${width - RIGHT} y1=${up.scale(tick)} y2=${up.scale(tick)} />
-            <text x=${LEFT - 6} y=${up.scale(tick) + 4} text-anchor="end">${short(tick)}</text>
-          </g>`,
-        )}
-        ${across.ticks.map(
-          (tick) => html`<g key=${tick}>
-            <line class="tick" x1=${across.scale(tick)} x2=${across.scale(tick)} y1=${HEIGHT - BOTTOM} y2=${HEIGHT - BOTTOM + 5} />
-            <text x=${across.scale(tick)} y=${HEIGHT - BOTTOM + 19} text-anchor="middle">${short(tick)}</text>
-          </g>`,
-        )}
-        <line class="axis" x1=${LEFT} x2=${width - RIGHT} y1=${HEIGHT - BOTTOM} y2=${HEIGHT - BOTTOM} />
-        ${marks.map(
-          (mark, row) => html`<g class="mark">
-            <line x1=${across.scale(mark.x)} x2=${across.scale(mark.x)} y1=${TOP} y2=${HEIGHT - BOTTOM} />
-            <text
-              x=${across.scale(mark.x) + (across.scale(mark.x) > width / 2 ? -5 : 5)}
-              y=${TOP + 10 + row * LINE}
-              text-anchor=${across.scale(mark.x) > width / 2 ? "end" : "start"}
-            >
-              ${mark.label}
-            </text>
-          </g>`,
-        )}
-        ${series.map((one) => drawn(one, across.scale, up.scale))}
-        <text x=${width - RIGHT} y=${HEIGHT - 6} text-anchor="end">${x.label} (${x.unit})</text>
-        <text x=${12} y=${TOP} transform=${`rotate(-90 12 ${TOP})`} text-anchor="end">
-          ${y.label} (${y.unit})
-        </text>
-      </svg>
-      <details>
-        <summary>As a table</summary>
-        <div class="table-scroll" tabindex="0" role="region" aria-label=${`${title}, as a table`}>
-          ${series.map((one) => tabled(one, x, y))}
-        </div>
-      </details>
-    </figure>
-  `;
+	const [box, width] = useWidth();
+	const points = series.flatMap((one) => one.points);
+	if (points.length === 0) return null;
+	const across = scaleOf(x, [...points.map((point) => point.x), ...marks.map((mark) => mark.x)], LEFT, width - RIGHT);
+	const heights = points.flatMap(({ y: at, low = at, high = at }) => [at, low, high]);
+	const up = scaleOf(y, heights, HEIGHT - BOTTOM, TOP);
+	const named = series.filter(({ name }) => name);
+	return html`
+		<figure class="chart" ref=${box}>
+			<figcaption class="row ends">
+				<span>${title}</span>
+				${named.length > 1 &&
+				html`<span class="row hint" aria-hidden="true">
+					${named.map((one) => html`<span class="row"><i class=${`key ${one.kind} ${one.tone}`}></i>${one.name}</span>`)}
+				</span>`}
+			</figcaption>
+			<svg role="img" aria-label=${title} viewBox=${`0 0 ${width} ${HEIGHT}`} width=${width} height=${HEIGHT}>
+				${up.ticks.map(
+					(tick) => html`<g key=${tick}>
+						<line class="grid" x1=${LEFT} x2=${width - RIGHT} y1=${up.scale(tick)} y2=${up.scale(tick)} />
+						<text x=${LEFT - 6} y=${up.scale(tick) + 4} text-anchor="end">${short(tick)}</text>
+					</g>`,
+				)}
+				${across.ticks.map(
+					(tick) => html`<g key=${tick}>
+						<line class="tick" x1=${across.scale(tick)} x2=${across.scale(tick)} y1=${HEIGHT - BOTTOM} y2=${HEIGHT - BOTTOM + 5} />
+						<text x=${across.scale(tick)} y=${HEIGHT - BOTTOM + 19} text-anchor="middle">${short(tick)}</text>
+					</g>`,
+				)}
+				<line class="axis" x1=${LEFT} x2=${width - RIGHT} y1=${HEIGHT - BOTTOM} y2=${HEIGHT - BOTTOM} />
+				${marks.map(
+					(mark, row) => html`<g class="mark">
+						<line x1=${across.scale(mark.x)} x2=${across.scale(mark.x)} y1=${TOP} y2=${HEIGHT - BOTTOM} />
+						<text
+							x=${across.scale(mark.x) + (across.scale(mark.x) > width / 2 ? -5 : 5)}
+							y=${TOP + 10 + row * LINE}
+							text-anchor=${across.scale(mark.x) > width / 2 ? "end" : "start"}
+						>
+							${mark.label}
+						</text>
+					</g>`,
+				)}
+				${series.map((one) => drawn(one, across.scale, up.scale))}
+				<text x=${width - RIGHT} y=${HEIGHT - 6} text-anchor="end">${x.label} (${x.unit})</text>
+				<text x=${12} y=${TOP} transform=${`rotate(-90 12 ${TOP})`} text-anchor="end">
+					${y.label} (${y.unit})
+				</text>
+			</svg>
+			<details>
+				<summary>As a table</summary>
+				<div class="table-scroll" tabindex="0" role="region" aria-label=${`${title}, as a table`}>
+					${series.map((one) => tabled(one, x, y))}
+				</div>
+			</details>
+		</figure>
+	`;
 }
 
 /** @returns {[import("preact").RefObject<HTMLElement>, number]} an element to watch, and its width */
 function useWidth() {
-  const box = useRef(/** @type {HTMLElement | null} */ (null));
-  const [width, setWidth] = useState(480);
-  useEffect(() => {
-    if (box.current === null) return undefined;
-    const observer = new ResizeObserver(([entry]) => {
-      if (entry.contentRect.width > 0) setWidth(Math.round(entry.contentRect.width));
-    });
-    observer.observe(box.current);
-    return () => observer.disconnect();
-  }, []);
-  return [box, width];
+	const box = useRef(/** @type {HTMLElement | null} */ (null));
+	const [width, setWidth] = useState(480);
+	useEffect(() => {
+		if (box.current === null) return undefined;
+		const observer = new ResizeObserver(([entry]) => {
+			if (entry.contentRect.width > 0) setWidth(Math.round(entry.contentRect.width));
+		});
+		observer.observe(box.current);
+		return () => observer.disconnect();
+	}, []);
+	return [box, width];
 }
 
-/**
- * @param {Axis} axis
- * @param {number[]} values
- * @param {number} start where the least value stands
- * @param {number} end
- * @returns {Scale}
- */
+/** @param {Axis} axis @param {number[]} values @param {number} start where the least value stands @param {number} end @returns {Scale} */
 function scaleOf({ from, to, isLog = false }, values, start, end) {
-  const low = from ?? Math.min(...values);
-  const high = Math.max(to ?? Math.max(...values), low + 1e-9);
-  const bend = isLog ? Math.log : (/** @type {number} */ value) => value;
-  const span = bend(high) - bend(low);
-  return {
-    scale: (value) => start + ((bend(value) - bend(low)) / span) * (end - start),
-    ticks: isLog ? logTicks(low, high) : ticksOf(low, high),
-  };
+	const low = from ?? Math.min(...values);
+	const high = Math.max(to ?? Math.max(...values), low + 1e-9);
+	const bend = isLog ? Math.log : (/** @type {number} */ value) => value;
+	const span = bend(high) - bend(low);
+	return {
+		scale: (value) => start + ((bend(value) - bend(low)) / span) * (end - start),
+		ticks: isLog ? logTicks(low, high) : ticksOf(low, high),
+	};
 }
 
-/**
- * @param {Series} one
- * @param {(value: number) => number} across
- * @param {(value: number) => number} up
- */
+/** @param {Series} one @param {(value: number) => number} across @param {(value: number) => number} up */
 function drawn({ kind, tone, points }, across, up) {
-  const place = (/** @type {number} */ x, /** @type {number} */ y) => `${across(x).toFixed(1)} ${up(y).toFixed(1)}`;
-  if (kind === "line") {
-    return html`<path class=${`line ${tone}`} d=${`M${points.map(({ x, y }) => place(x, y)).join("L")}`} />`;
-  }
-  if (kind === "band") {
-    const upper = points.map(({ x, y, high = y }) => place(x, high));
-    const lower = points.map(({ x, y, low = y }) => place(x, low)).reverse();
-    return html`<path class=${`band ${tone}`} d=${`M${[...upper, ...lower].join("L")}Z`} />`;
-  }
-  return points.map(
-    ({ x, y, label }) => html`<circle class=${`dot ${tone}`} cx=${across(x)} cy=${up(y)} r="3">
-      ${label && html`<title>${label}</title>`}
-    </circle>`,
-  );
+	const place = (/** @type {number} */ x, /** @type {number} */ y) => `${across(x).toFixed(1)} ${up(y).toFixed(1)}`;
+	if (kind === "line") {
+		return html`<path class=${`line ${tone}`} d=${`M${points.map(({ x, y }) => place(x, y)).join("L")}`} />`;
+	}
+	if (kind === "band") {
+		const upper = points.map(({ x, y, high = y }) => place(x, high));
+		const lower = points.map(({ x, y, low = y }) => place(x, low)).reverse();
+		return html`<path class=${`band ${tone}`} d=${`M${[...upper, ...lower].join("L")}Z`} />`;
+	}
+	return points.map(
+		({ x, y, label }) => html`<circle class=${`dot ${tone}`} cx=${across(x)} cy=${up(y)} r="3">
+			${label && html`<title>${label}</title>`}
+		</circle>`,
+	);
 }
 
-/**
- * @param {Series} one
- * @param {Axis} x
- * @param {Axis} y
- */
+/** @param {Series} one @param {Axis} x @param {Axis} y */
 function tabled({ name, kind, points }, x, y) {
-  const every = Math.ceil(points.length / MOST_ROWS);
-  const rows = points.filter((_, number) => number % every === 0);
-  const isBand = kind === "band";
-  const head = [x.label, ...(isBand ? ["Low", "High"] : [y.label])];
-  return html`<table>
-    ${name && html`<caption>${name}</caption>`}
-    <thead>
-      <tr>${head.map((words, at) => html`<th scope="col" class="number">${words} (${at ? y.unit : x.unit})</th>`)}</tr>
-    </thead>
-    <tbody>
-      ${rows.map((point) => {
-        const numbers = isBand ? [point.x, point.low, point.high] : [point.x, point.y];
-        return html`<tr>${numbers.map((number) => html`<td class="number">${short(number)}</td>`)}</tr>`;
-      })}
-    </tbody>
-  </table>`;
+	const every = Math.ceil(points.length / MOST_ROWS);
+	const rows = points.filter((_, number) => number % every === 0);
+	const isBand = kind === "band";
+	const head = [x.label, ...(isBand ? ["Low", "High"] : [y.label])];
+	return html`<table>
+		${name && html`<caption>${name}</caption>`}
+		<thead>
+			<tr>${head.map((words, at) => html`<th scope="col" class="number">${words} (${at ? y.unit : x.unit})</th>`)}</tr>
+		</thead>
+		<tbody>
+			${rows.map((point) => {
+				const numbers = isBand ? [point.x, point.low, point.high] : [point.x, point.y];
+				return html`<tr>${numbers.map((number) => html`<td class="number">${short(number)}</td>`)}</tr>`;
+			})}
+		</tbody>
+	</table>`;
 }

@@ -13,18 +13,18 @@ const scope = /** @type {Worker} */ (/** @type {unknown} */ (globalThis));
 let cloud = null;
 
 scope.onmessage = (/** @type {MessageEvent<Opening | Order>} */ { data }) => {
-  if (data.kind === "open") {
-    cloud = Cloud.on(data.canvas, (count) => scope.postMessage({ drawn: count }));
-    if (cloud === null) scope.postMessage({ isMissing: true });
-  } else if (data.kind === "show") {
-    cloud?.show(data.points);
-  } else if (data.kind === "resize") {
-    cloud?.resize(data.width, data.height);
-  } else if (data.kind === "orbit") {
-    cloud?.orbit(data.right, data.down);
-  } else if (data.kind === "zoom") {
-    cloud?.zoom(data.factor);
-  } else {
-    cloud?.reset();
-  }
+	if (data.kind === "open") {
+		cloud = Cloud.on(data.canvas, (count) => scope.postMessage({ drawn: count }));
+		if (cloud === null) scope.postMessage({ isMissing: true });
+	} else if (data.kind === "show") {
+		cloud?.show(data.points);
+	} else if (data.kind === "resize") {
+		cloud?.resize(data.width, data.height);
+	} else if (data.kind === "orbit") {
+		cloud?.orbit(data.right, data.down);
+	} else if (data.kind === "zoom") {
+		cloud?.zoom(data.factor);
+	} else {
+		cloud?.reset();
+	}
 };

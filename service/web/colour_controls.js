@@ -10,75 +10,75 @@ const LEAST_RATIO = 1.01;
 
 /** @param {{look: Look, facts: import("./maps.js").Facts, onLook: (look: Look) => void}} props */
 export function Colours({ look, facts, onLook }) {
-  const { spread, validShare, eitherShare } = facts;
-  const change = (/** @type {Partial<Look>} */ part) => onLook({ ...look, ...part });
-  return html`<section class="card stack" aria-label="Colours">
-    <h3>Colours</h3>
-    <label class="field"
-      >Map
-      <select value=${look.map} onChange=${(/** @type {any} */ event) => change({ map: event.target.value })}>
-        ${MAPS.map(([value, title]) => html`<option key=${value} value=${value}>${title}</option>`)}
-      </select>
-    </label>
-    ${spread &&
-    html`
-      <${Bound} title="Near" value=${look.nearM} ...${spread}
-        onValue=${(/** @type {number} */ value) => change({ nearM: Math.min(value, look.farM / LEAST_RATIO) })} />
-      <${Bound} title="Far" value=${look.farM} ...${spread}
-        onValue=${(/** @type {number} */ value) => change({ farM: Math.max(value, look.nearM * LEAST_RATIO) })} />
-      <div class="row">
-        <button type="button" onClick=${() => change({ nearM: spread.nearM, farM: spread.farM })}>Fit to 2–98 %</button>
-        <button type="button" onClick=${() => change({ nearM: spread.leastM, farM: spread.mostM })}>Whole range</button>
-      </div>
-    `}
-    <${Switch} title=${`Hatch no answer (${share(1 - validShare)})`} isOn=${look.hatchesNothing}
-      onSwitch=${(/** @type {boolean} */ hatchesNothing) => change({ hatchesNothing })} />
-    <${Switch} title=${`Dot either side (${share(eitherShare)})`} isOn=${look.dotsEither}
-      onSwitch=${(/** @type {boolean} */ dotsEither) => change({ dotsEither })} />
-  </section>`;
+	const { spread, validShare, eitherShare } = facts;
+	const change = (/** @type {Partial<Look>} */ part) => onLook({ ...look, ...part });
+	return html`<section class="card stack" aria-label="Colours">
+		<h3>Colours</h3>
+		<label class="field"
+			>Map
+			<select value=${look.map} onChange=${(/** @type {any} */ event) => change({ map: event.target.value })}>
+				${MAPS.map(([value, title]) => html`<option key=${value} value=${value}>${title}</option>`)}
+			</select>
+		</label>
+		${spread &&
+		html`
+			<${Bound} title="Near" value=${look.nearM} ...${spread}
+				onValue=${(/** @type {number} */ value) => change({ nearM: Math.min(value, look.farM / LEAST_RATIO) })} />
+			<${Bound} title="Far" value=${look.farM} ...${spread}
+				onValue=${(/** @type {number} */ value) => change({ farM: Math.max(value, look.nearM * LEAST_RATIO) })} />
+			<div class="row">
+				<button type="button" onClick=${() => change({ nearM: spread.nearM, farM: spread.farM })}>Fit to 2–98 %</button>
+				<button type="button" onClick=${() => change({ nearM: spread.leastM, farM: spread.mostM })}>Whole range</button>
+			</div>
+		`}
+		<${Switch} title=${`Hatch no answer (${share(1 - validShare)})`} isOn=${look.hatchesNothing}
+			onSwitch=${(/** @type {boolean} */ hatchesNothing) => change({ hatchesNothing })} />
+		<${Switch} title=${`Dot either side (${share(eitherShare)})`} isOn=${look.dotsEither}
+			onSwitch=${(/** @type {boolean} */ dotsEither) => change({ dotsEither })} />
+	</section>`;
 }
 
 /** @param {{title: string, value: number, leastM: number, mostM: number, onValue: (value: number) => void}} props */
 function Bound({ title, value, leastM, mostM, onValue }) {
-  // what is being typed stays, whatever is drawn anew meanwhile
-  const [typed, setTyped] = useState(/** @type {string | null} */ (null));
-  const span = Math.log(mostM / leastM);
-  return html`<div class="depth-bound">
-    <span>${title}</span>
-    <input
-      type="range"
-      min="0"
-      max=${STEPS}
-      value=${Math.round((STEPS * Math.log(value / leastM)) / span)}
-      aria-label=${`${title} end of the colours`}
-      aria-valuetext=${`${value.toFixed(2)} metres`}
-      onInput=${(/** @type {any} */ event) => onValue(leastM * Math.exp((span * event.target.value) / STEPS))}
-    />
-    <input
-      type="number"
-      step="any"
-      min="0.001"
-      value=${typed ?? value.toFixed(3)}
-      aria-label=${`${title} end of the colours, metres`}
-      onInput=${(/** @type {any} */ event) => setTyped(event.target.value)}
-      onChange=${(/** @type {any} */ event) => {
-        setTyped(null);
-        if (event.target.value > 0) onValue(Number(event.target.value));
-      }}
-    />
-    <span>m</span>
-  </div>`;
+	// what is being typed stays, whatever is drawn anew meanwhile
+	const [typed, setTyped] = useState(/** @type {string | null} */ (null));
+	const span = Math.log(mostM / leastM);
+	return html`<div class="depth-bound">
+		<span>${title}</span>
+		<input
+			type="range"
+			min="0"
+			max=${STEPS}
+			value=${Math.round((STEPS * Math.log(value / leastM)) / span)}
+			aria-label=${`${title} end of the colours`}
+			aria-valuetext=${`${value.toFixed(2)} metres`}
+			onInput=${(/** @type {any} */ event) => onValue(leastM * Math.exp((span * event.target.value) / STEPS))}
+		/>
+		<input
+			type="number"
+			step="any"
+			min="0.001"
+			value=${typed ?? value.toFixed(3)}
+			aria-label=${`${title} end of the colours, metres`}
+			onInput=${(/** @type {any} */ event) => setTyped(event.target.value)}
+			onChange=${(/** @type {any} */ event) => {
+				setTyped(null);
+				if (event.target.value > 0) onValue(Number(event.target.value));
+			}}
+		/>
+		<span>m</span>
+	</div>`;
 }
 
 /** @param {{title: string, isOn: boolean, onSwitch: (isOn: boolean) => void}} props */
 function Switch({ title, isOn, onSwitch }) {
-  return html`<label class="choice">
-    <input type="checkbox" checked=${isOn} onChange=${(/** @type {any} */ event) => onSwitch(event.target.checked)} />
-    ${title}
-  </label>`;
+	return html`<label class="choice">
+		<input type="checkbox" checked=${isOn} onChange=${(/** @type {any} */ event) => onSwitch(event.target.checked)} />
+		${title}
+	</label>`;
 }
 
 /** @param {number} part */
 function share(part) {
-  return part > 0 && part < 0.01 ? "< 1 %" : `${Math.round(100 * part)} %`;
+	return part > 0 && part < 0.01 ? "< 1 %" : `${Math.round(100 * part)} %`;
 }

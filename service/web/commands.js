@@ -10,52 +10,46 @@
 
 /** @type {Record<string, {ending: string, says: string}>} */
 export const FORMATS = {
-  png: { ending: "png", says: "PNG, 16-bit millimetres" },
-  npy: { ending: "npy", says: "NumPy, metres" },
-  npz: { ending: "npz", says: "NumPy, all maps" },
-  tiff: { ending: "tiff", says: "TIFF, float metres" },
-  ply: { ending: "ply", says: "PLY, coloured points" },
-  preview: { ending: "jpg", says: "JPEG, for the eye" },
-  json: { ending: "json", says: "JSON, summary" },
+	png: { ending: "png", says: "PNG, 16-bit millimetres" },
+	npy: { ending: "npy", says: "NumPy, metres" },
+	npz: { ending: "npz", says: "NumPy, all maps" },
+	tiff: { ending: "tiff", says: "TIFF, float metres" },
+	ply: { ending: "ply", says: "PLY, coloured points" },
+	preview: { ending: "jpg", says: "JPEG, for the eye" },
+	json: { ending: "json", says: "JSON, summary" },
 };
 
-/**
- * @param {Ask} ask
- * @returns {string} path and query, relative to the page
- */
+/** @param {Ask} ask @returns {string} path and query, relative to the page */
 export function depthPath({ camera, side, focusM, format }) {
-  const query = new URLSearchParams({ camera });
-  if (side !== "auto") query.set("side", side);
-  if (focusM !== null) query.set("focus_distance_m", String(focusM));
-  query.set("format", format);
-  return `depth?${query}`;
+	const query = new URLSearchParams({ camera });
+	if (side !== "auto") query.set("side", side);
+	if (focusM !== null) query.set("focus_distance_m", String(focusM));
+	query.set("format", format);
+	return `depth?${query}`;
 }
 
-/**
- * @param {string} photograph the file's name
- * @param {string} format
- */
+/** @param {string} photograph the file's name @param {string} format */
 export function answerName(photograph, format) {
-  return `${photograph.replace(/\.[^.]*$/, "") || "photograph"}-depth.${FORMATS[format].ending}`;
+	return `${photograph.replace(/\.[^.]*$/, "") || "photograph"}-depth.${FORMATS[format].ending}`;
 }
 
 /** @typedef {{url: string, photograph: string, mediaType: string, answer: string, hasKey: boolean}} Command */
 
 /** @param {Command} command the key itself is never in it, but the shell's variable for it */
 export function curlCommand({ url, photograph, mediaType, answer, hasKey }) {
-  return [
-    `curl --fail-with-body ${quoted(url)}`,
-    ...(hasKey ? ['  -H "Authorization: Bearer $CAMIND_API_KEY"'] : []),
-    `  -H ${quoted(`Content-Type: ${mediaType}`)}`,
-    `  --data-binary ${quoted(`@${photograph}`)} -o ${quoted(answer)}`,
-  ].join(" \\\n");
+	return [
+		`curl --fail-with-body ${quoted(url)}`,
+		...(hasKey ? ['  -H "Authorization: Bearer $CAMIND_API_KEY"'] : []),
+		`  -H ${quoted(`Content-Type: ${mediaType}`)}`,
+		`  --data-binary ${quoted(`@${photograph}`)} -o ${quoted(answer)}`,
+	].join(" \\\n");
 }
 
 /** @param {Command} command runs with the standard library alone */
 export function pythonCommand({ url, photograph, mediaType, answer, hasKey }) {
-  const headers = [`"Content-Type": ${JSON.stringify(mediaType)}`];
-  if (hasKey) headers.push('"Authorization": "Bearer " + os.environ["CAMIND_API_KEY"]');
-  return `${hasKey ? "import os\n" : ""}from pathlib import Path
+	const headers = [`"Content-Type": ${JSON.stringify(mediaType)}`];
+	if (hasKey) headers.push('"Authorization": "Bearer " + os.environ["CAMIND_API_KEY"]');
+	return `${hasKey ? "import os\n" : ""}from pathlib import Path
 from urllib.request import Request, urlopen
 
 request = Request(
@@ -71,5 +65,5 @@ with urlopen(request) as answer:
 
 /** @param {string} text as one word of a POSIX shell */
 function quoted(text) {
-  return `'${text.replaceAll("'", "'\\''")}'`;
+	return `'${text.replaceAll("'", "'\\''")}'`;
 }

@@ -35,9 +35,9 @@ import { html, useCallback, useEffect, useMemo, useRef, useState } from "./vendo
 /** @typedef {{step: "upload", fraction: number | null} | {step: "work", since: number} | {step: "draw"}} Phase */
 
 const SIDES = [
-  ["auto", "Let the model decide"],
-  ["near", "Nearer than focus"],
-  ["far", "Beyond focus"],
+	["auto", "Let the model decide"],
+	["near", "Nearer than focus"],
+	["far", "Beyond focus"],
 ];
 const PHOTOGRAPH_MOST_PX = 1600;
 const NOT_THE_FRAME = "urn:camind:problem:image-size-mismatch";
@@ -46,440 +46,426 @@ const FIRST_LOOK = { map: "cividis", nearM: 1, farM: 2, hatchesNothing: true, do
 
 /** @param {import("./app.js").ViewProps} props */
 export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, announce }) {
-  const reader = useMemo(() => new DepthReader(), []);
-  const [file, setFile] = useState(/** @type {File | null} */ (null));
-  const [photograph, setPhotograph] = useState(
-    /** @type {{bitmap: ImageBitmap, width: number, height: number} | null} */ (null),
-  );
-  const [name, setName] = useState("");
-  const [side, setSide] = useState("auto");
-  const [focusM, setFocusM] = useState(/** @type {number | null} */ (null));
-  const [attempt, setAttempt] = useState(0);
-  const [isDrafting, setIsDrafting] = useState(false);
-  const [phase, setPhase] = useState(/** @type {Phase | null} */ (null));
-  const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
-  const [result, setResult] = useState(/** @type {Result | null} */ (null));
-  const [look, setLook] = useState(FIRST_LOOK);
-  const [isOpening, setIsOpening] = useState(false);
-  const [reading, setReading] = useState(/** @type {Reading | null} */ (null));
-  const [marks, setMarks] = useState(/** @type {Pixel[]} */ ([]));
-  const [picture, setPicture] = useState("photograph");
-  const [counts, setCounts] = useState(/** @type {Uint32Array | null} */ (null));
-  const [measured, setMeasured] = useState(/** @type {Measured | null} */ (null));
-  const running = useRef(/** @type {AbortController | null} */ (null));
-  const newest = useRef(/** @type {File | null} */ (null));
+	const reader = useMemo(() => new DepthReader(), []);
+	const [file, setFile] = useState(/** @type {File | null} */ (null));
+	const [photograph, setPhotograph] = useState(
+		/** @type {{bitmap: ImageBitmap, width: number, height: number} | null} */ (null),
+	);
+	const [name, setName] = useState("");
+	const [side, setSide] = useState("auto");
+	const [focusM, setFocusM] = useState(/** @type {number | null} */ (null));
+	const [attempt, setAttempt] = useState(0);
+	const [isDrafting, setIsDrafting] = useState(false);
+	const [phase, setPhase] = useState(/** @type {Phase | null} */ (null));
+	const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
+	const [result, setResult] = useState(/** @type {Result | null} */ (null));
+	const [look, setLook] = useState(FIRST_LOOK);
+	const [isOpening, setIsOpening] = useState(false);
+	const [reading, setReading] = useState(/** @type {Reading | null} */ (null));
+	const [marks, setMarks] = useState(/** @type {Pixel[]} */ ([]));
+	const [picture, setPicture] = useState("photograph");
+	const [counts, setCounts] = useState(/** @type {Uint32Array | null} */ (null));
+	const [measured, setMeasured] = useState(/** @type {Measured | null} */ (null));
+	const running = useRef(/** @type {AbortController | null} */ (null));
+	const newest = useRef(/** @type {File | null} */ (null));
 
-  const camera = cameras?.find((one) => one.name === name) ?? null;
-  const ask = { camera: name, side, focusM };
+	const camera = cameras?.find((one) => one.name === name) ?? null;
+	const ask = { camera: name, side, focusM };
 
-  useEffect(() => {
-    if (brought !== null) setName(brought);
-  }, [brought]);
+	useEffect(() => {
+		if (brought !== null) setName(brought);
+	}, [brought]);
 
-  const take = useCallback(async (/** @type {File | null | undefined} */ taken) => {
-    if (!taken) return;
-    setResult(null);
-    setReading(null);
-    setMarks([]);
-    setPhotograph(null);
-    setIsOpening(true);
-    setIsDrafting(false);
-    setFile(taken);
-    newest.current = taken;
-    const isNewest = () => newest.current === taken;
-    const mostPx = PHOTOGRAPH_MOST_PX;
-    const found = await readShown(taken, mostPx, async (shown) =>
-      isNewest() ? reader.ask("photograph", { file: shown, mostPx }).catch(() => null) : null,
-    );
-    if (!isNewest()) return;
-    setPhotograph(found);
-    setIsOpening(false);
-  }, []);
+	const take = useCallback(async (/** @type {File | null | undefined} */ taken) => {
+		if (!taken) return;
+		setResult(null);
+		setReading(null);
+		setMarks([]);
+		setPhotograph(null);
+		setIsOpening(true);
+		setIsDrafting(false);
+		setFile(taken);
+		newest.current = taken;
+		const isNewest = () => newest.current === taken;
+		const mostPx = PHOTOGRAPH_MOST_PX;
+		const found = await readShown(taken, mostPx, async (shown) =>
+			isNewest() ? reader.ask("photograph", { file: shown, mostPx }).catch(() => null) : null,
+		);
+		if (!isNewest()) return;
+		setPhotograph(found);
+		setIsOpening(false);
+	}, []);
 
-  useFilesFromOutside(shown, take);
+	useFilesFromOutside(shown, take);
 
-  useEffect(() => {
-    setMeasured(null);
-    if (marks.length < 2) return undefined;
-    let isWanted = true;
-    reader.ask("distance", { from: marks[0], to: marks[1] }).then((distance) => {
-      if (!isWanted) return;
-      setMeasured(distance ?? "unknown");
-      if (distance) announce(`The points are ${metres(distance.distanceM)} apart.`);
-    });
-    return () => {
-      isWanted = false;
-    };
-  }, [marks]);
+	useEffect(() => {
+		setMeasured(null);
+		if (marks.length < 2) return undefined;
+		let isWanted = true;
+		reader.ask("distance", { from: marks[0], to: marks[1] }).then((distance) => {
+			if (!isWanted) return;
+			setMeasured(distance ?? "unknown");
+			if (distance) announce(`The points are ${metres(distance.distanceM)} apart.`);
+		});
+		return () => {
+			isWanted = false;
+		};
+	}, [marks]);
 
-  useEffect(() => {
-    if (file === null || camera === null) {
-      setPhase(null);
-      return undefined;
-    }
-    const abort = new AbortController();
-    running.current = abort;
-    run(file, abort.signal);
-    return () => abort.abort();
-  }, [file, camera?.name, camera?.revision, side, focusM, attempt]);
+	useEffect(() => {
+		if (file === null || camera === null) {
+			setPhase(null);
+			return undefined;
+		}
+		const abort = new AbortController();
+		running.current = abort;
+		run(file, abort.signal);
+		return () => abort.abort();
+	}, [file, camera?.name, camera?.revision, side, focusM, attempt]);
 
-  /**
-   * @param {File} sent
-   * @param {AbortSignal} signal
-   */
-  async function run(sent, signal) {
-    const show = (/** @type {Phase | null} */ next) => signal.aborted || setPhase(next);
-    setProblem(null);
-    show({ step: "upload", fraction: 0 });
-    announce("Sending the photograph.");
-    try {
-      const answer = await upload(depthPath({ ...ask, format: "npz" }), {
-        body: sent,
-        headers: { "Content-Type": mediaTypeOf(sent) },
-        // a Blob: the browser keeps it outside the page, and the worker takes the arrays out of it one by one
-        responseType: "blob",
-        signal,
-        onProgress: (fraction) =>
-          show(fraction === 1 ? { step: "work", since: performance.now() } : { step: "upload", fraction }),
-      });
-      show({ step: "draw" });
-      const facts = await reader.ask("load", { npz: answer.body });
-      if (signal.aborted) return;
-      const { spread } = facts;
-      if (spread) setLook((before) => ({ ...before, nearM: spread.nearM, farM: spread.farM }));
-      setResult({
-        asked: ask,
-        file: sent,
-        facts,
-        npz: answer.body,
-        warnings: (answer.headers.get("Camind-Warnings") ?? "").split("; ").filter(Boolean),
-        timings: readTimings(answer.headers.get("Server-Timing") ?? ""),
-        model: answer.headers.get("Camind-Model") ?? "",
-      });
-      setReading(null);
-      setMarks([]);
-      setPhase(null);
-      announce(
-        spread
-          ? `Depth is ready: ${spread.nearM.toFixed(2)} to ${spread.farM.toFixed(2)} metres.`
-          : "The photograph gives no answer.",
-      );
-    } catch (error) {
-      if (signal.aborted) return;
-      setResult(null);
-      setPhase(null);
-      setProblem(error instanceof Problem ? error : unreadable(error));
-    }
-  }
+	/** @param {File} sent @param {AbortSignal} signal */
+	async function run(sent, signal) {
+		const show = (/** @type {Phase | null} */ next) => signal.aborted || setPhase(next);
+		setProblem(null);
+		show({ step: "upload", fraction: 0 });
+		announce("Sending the photograph.");
+		try {
+			const answer = await upload(depthPath({ ...ask, format: "npz" }), {
+				body: sent,
+				headers: { "Content-Type": mediaTypeOf(sent) },
+				// a Blob: the browser keeps it outside the page, and the worker takes the arrays out of it one by one
+				responseType: "blob",
+				signal,
+				onProgress: (fraction) =>
+					show(fraction === 1 ? { step: "work", since: performance.now() } : { step: "upload", fraction }),
+			});
+			show({ step: "draw" });
+			const facts = await reader.ask("load", { npz: answer.body });
+			if (signal.aborted) return;
+			const { spread } = facts;
+			if (spread) setLook((before) => ({ ...before, nearM: spread.nearM, farM: spread.farM }));
+			setResult({
+				asked: ask,
+				file: sent,
+				facts,
+				npz: answer.body,
+				warnings: (answer.headers.get("Camind-Warnings") ?? "").split("; ").filter(Boolean),
+				timings: readTimings(answer.headers.get("Server-Timing") ?? ""),
+				model: answer.headers.get("Camind-Model") ?? "",
+			});
+			setReading(null);
+			setMarks([]);
+			setPhase(null);
+			announce(
+				spread
+					? `Depth is ready: ${spread.nearM.toFixed(2)} to ${spread.farM.toFixed(2)} metres.`
+					: "The photograph gives no answer.",
+			);
+		} catch (error) {
+			if (signal.aborted) return;
+			setResult(null);
+			setPhase(null);
+			setProblem(error instanceof Problem ? error : unreadable(error));
+		}
+	}
 
-  function cancel() {
-    running.current?.abort();
-    setPhase(null);
-    setResult(null);
-    setProblem(new Problem({ status: 0, title: "Cancelled.", detail: "The service has stopped working on it." }));
-    announce("Cancelled.");
-  }
+	function cancel() {
+		running.current?.abort();
+		setPhase(null);
+		setResult(null);
+		setProblem(new Problem({ status: 0, title: "Cancelled.", detail: "The service has stopped working on it." }));
+		announce("Cancelled.");
+	}
 
-  const again = () => setAttempt((count) => count + 1);
-  const isNotTheFrame = problem?.type === NOT_THE_FRAME;
-  const wantsDraft = file !== null && cameras !== null && (isDrafting || camera === null);
-  const warned = (/** @type {"camera" | "focus" | "result"} */ place) =>
-    (result?.warnings ?? []).filter((text) => placeOfWarning(text) === place);
-  const size = result?.facts ?? photograph;
+	const again = () => setAttempt((count) => count + 1);
+	const isNotTheFrame = problem?.type === NOT_THE_FRAME;
+	const wantsDraft = file !== null && cameras !== null && (isDrafting || camera === null);
+	const warned = (/** @type {"camera" | "focus" | "result"} */ place) =>
+		(result?.warnings ?? []).filter((text) => placeOfWarning(text) === place);
+	const size = result?.facts ?? photograph;
 
-  return html`
-    <div class="depth stack">
-      <h2 class="visually-hidden">Depth</h2>
-      <div class="depth-ask">
-        <div class="stack depth-camera">
-          <label class="field"
-            >Camera
-            <select
-              value=${camera ? name : ""}
-              aria-invalid=${isNotTheFrame}
-              onChange=${(/** @type {any} */ event) => {
-                setIsDrafting(false);
-                setName(event.target.value);
-              }}
-            >
-              <option value="" disabled>${cameras === null ? "Loading…" : "Choose the camera that took it"}</option>
-              ${(cameras ?? []).map((one) => html`<option key=${one.name} value=${one.name}>${one.name}</option>`)}
-            </select>
-          </label>
-          ${camera && html`<p class="hint">${about(camera)}</p>`}
-          ${cameras?.length === 0 &&
-          html`<p class="hint">
-            No camera is stored yet. Give a photograph, and its EXIF drafts one; or${" "}
-            <button type="button" class="depth-link" onClick=${() => go("cameras")}>make one yourself</button>.
-          </p>`}
-          <${Warnings} texts=${warned("camera")} />
-        </div>
-        <label class="field"
-          >Side of the plane in focus
-          <select value=${side} onChange=${(/** @type {any} */ event) => setSide(event.target.value)}>
-            ${SIDES.map(([value, says]) => html`<option key=${value} value=${value}>${says}</option>`)}
-          </select>
-        </label>
-        <div class="stack">
-          <${FocusField} camera=${camera} onFocusM=${setFocusM} />
-          <${Warnings} texts=${warned("focus")} />
-        </div>
-        <${FileButtons} hasFile=${file !== null} onFile=${take} />
-      </div>
+	return html`
+		<div class="depth stack">
+			<h2 class="visually-hidden">Depth</h2>
+			<div class="depth-ask">
+				<div class="stack depth-camera">
+					<label class="field"
+						>Camera
+						<select
+							value=${camera ? name : ""}
+							aria-invalid=${isNotTheFrame}
+							onChange=${(/** @type {any} */ event) => {
+								setIsDrafting(false);
+								setName(event.target.value);
+							}}
+						>
+							<option value="" disabled>${cameras === null ? "Loading…" : "Choose the camera that took it"}</option>
+							${(cameras ?? []).map((one) => html`<option key=${one.name} value=${one.name}>${one.name}</option>`)}
+						</select>
+					</label>
+					${camera && html`<p class="hint">${about(camera)}</p>`}
+					${cameras?.length === 0 &&
+					html`<p class="hint">
+						No camera is stored yet. Give a photograph, and its EXIF drafts one; or${" "}
+						<button type="button" class="depth-link" onClick=${() => go("cameras")}>make one yourself</button>.
+					</p>`}
+					<${Warnings} texts=${warned("camera")} />
+				</div>
+				<label class="field"
+					>Side of the plane in focus
+					<select value=${side} onChange=${(/** @type {any} */ event) => setSide(event.target.value)}>
+						${SIDES.map(([value, says]) => html`<option key=${value} value=${value}>${says}</option>`)}
+					</select>
+				</label>
+				<div class="stack">
+					<${FocusField} camera=${camera} onFocusM=${setFocusM} />
+					<${Warnings} texts=${warned("focus")} />
+				</div>
+				<${FileButtons} hasFile=${file !== null} onFile=${take} />
+			</div>
 
-      <${ProblemBox}
-        problem=${problem}
-        onRetry=${problem && !isNotTheFrame && file && camera ? again : undefined}
-        onClose=${problem ? () => setProblem(null) : undefined}
-      />
-      ${isNotTheFrame &&
-      !isDrafting &&
-      html`<div class="row">
-        <button type="button" onClick=${() => setIsDrafting(true)}>Draft a camera from this photograph</button>
-      </div>`}
-      ${wantsDraft &&
-      html`<${DraftForm}
-        key=${file}
-        file=${file}
-        mediaType=${mediaTypeOf(/** @type {File} */ (file))}
-        onStored=${async (/** @type {string} */ stored) => {
-          await reloadCameras();
-          setIsDrafting(false);
-          setProblem(null);
-          setName(stored);
-        }}
-      />`}
-      <${Progress} phase=${phase} onCancel=${cancel} />
+			<${ProblemBox}
+				problem=${problem}
+				onRetry=${problem && !isNotTheFrame && file && camera ? again : undefined}
+				onClose=${problem ? () => setProblem(null) : undefined}
+			/>
+			${isNotTheFrame &&
+			!isDrafting &&
+			html`<div class="row">
+				<button type="button" onClick=${() => setIsDrafting(true)}>Draft a camera from this photograph</button>
+			</div>`}
+			${wantsDraft &&
+			html`<${DraftForm}
+				key=${file}
+				file=${file}
+				mediaType=${mediaTypeOf(/** @type {File} */ (file))}
+				onStored=${async (/** @type {string} */ stored) => {
+					await reloadCameras();
+					setIsDrafting(false);
+					setProblem(null);
+					setName(stored);
+				}}
+			/>`}
+			<${Progress} phase=${phase} onCancel=${cancel} />
 
-      ${size === null
-        ? html`<${DropPlace} file=${file} isOpening=${isOpening} />`
-        : html`<div class=${`depth-grid ${phase && result ? "depth-stale" : ""}`}>
-            <div class="stack">
-              ${result &&
-              html`<${PictureTabs} picture=${picture} onPicture=${setPicture} />`}
-              <div
-                id="depth-picture-photograph"
-                class="stack"
-                role=${result ? "tabpanel" : undefined}
-                aria-labelledby=${result ? "depth-tab-photograph" : undefined}
-                hidden=${result !== null && picture !== "photograph"}
-              >
-                <${Stage}
-                  ...${{ reader, size, look, reading, marks, measured, announce }}
-                  bitmap=${photograph?.bitmap ?? null}
-                  result=${result}
-                  onReading=${setReading}
-                  onMarks=${setMarks}
-                  onCounts=${setCounts}
-                />
-              </div>
-              ${result &&
-              html`<div
-                id="depth-picture-cloud"
-                role="tabpanel"
-                aria-labelledby="depth-tab-cloud"
-                hidden=${picture !== "cloud"}
-              >
-                <${CloudView}
-                  ...${{ reader, result, look }}
-                  hasPhotograph=${photograph !== null}
-                  isShown=${shown && picture === "cloud"}
-                />
-              </div>`}
-              ${result?.facts.spread && html`<${Legend} look=${look} counts=${counts} />`}
-            </div>
-            ${result &&
-            html`<div class="stack depth-side-panel">
-              <${Warnings} texts=${warned("result")} />
-              <${Readout} reading=${reading} />
-              <${Distance} ...${{ marks, measured }} hasPoints=${result.facts.hasPoints} onClear=${() => setMarks([])} />
-              <${Colours} look=${look} facts=${result.facts} onLook=${setLook} />
-              <${Exports} key=${result.model + JSON.stringify(result.asked)} result=${result} announce=${announce} />
-              <${Timings} timings=${result.timings} model=${result.model} />
-            </div>`}
-          </div>`}
-    </div>
-  `;
+			${size === null
+				? html`<${DropPlace} file=${file} isOpening=${isOpening} />`
+				: html`<div class=${`depth-grid ${phase && result ? "depth-stale" : ""}`}>
+						<div class="stack">
+							${result &&
+							html`<${PictureTabs} picture=${picture} onPicture=${setPicture} />`}
+							<div
+								id="depth-picture-photograph"
+								class="stack"
+								role=${result ? "tabpanel" : undefined}
+								aria-labelledby=${result ? "depth-tab-photograph" : undefined}
+								hidden=${result !== null && picture !== "photograph"}
+							>
+								<${Stage}
+									...${{ reader, size, look, reading, marks, measured, announce }}
+									bitmap=${photograph?.bitmap ?? null}
+									result=${result}
+									onReading=${setReading}
+									onMarks=${setMarks}
+									onCounts=${setCounts}
+								/>
+							</div>
+							${result &&
+							html`<div
+								id="depth-picture-cloud"
+								role="tabpanel"
+								aria-labelledby="depth-tab-cloud"
+								hidden=${picture !== "cloud"}
+							>
+								<${CloudView}
+									...${{ reader, result, look }}
+									hasPhotograph=${photograph !== null}
+									isShown=${shown && picture === "cloud"}
+								/>
+							</div>`}
+							${result?.facts.spread && html`<${Legend} look=${look} counts=${counts} />`}
+						</div>
+						${result &&
+						html`<div class="stack depth-side-panel">
+							<${Warnings} texts=${warned("result")} />
+							<${Readout} reading=${reading} />
+							<${Distance} ...${{ marks, measured }} hasPoints=${result.facts.hasPoints} onClear=${() => setMarks([])} />
+							<${Colours} look=${look} facts=${result.facts} onLook=${setLook} />
+							<${Exports} key=${result.model + JSON.stringify(result.asked)} result=${result} announce=${announce} />
+							<${Timings} timings=${result.timings} model=${result.model} />
+						</div>`}
+					</div>`}
+		</div>
+	`;
 }
 
-/**
- * Photographs that are dropped anywhere on the view, or pasted.
- *
- * @param {boolean} shown
- * @param {(file: File | null | undefined) => void} take
- */
+/** Photographs that are dropped anywhere on the view, or pasted. @param {boolean} shown @param {(file: File | null | undefined) => void} take */
 function useFilesFromOutside(shown, take) {
-  useEffect(() => {
-    if (!shown) return undefined;
-    const drop = (/** @type {DragEvent} */ event) => {
-      if (!event.dataTransfer?.files.length) return;
-      event.preventDefault();
-      take(event.dataTransfer.files[0]);
-    };
-    const paste = (/** @type {ClipboardEvent} */ event) => {
-      take(Array.from(event.clipboardData?.files ?? []).find((file) => file.type.startsWith("image/")));
-    };
-    document.addEventListener("drop", drop);
-    document.addEventListener("paste", paste);
-    return () => {
-      document.removeEventListener("drop", drop);
-      document.removeEventListener("paste", paste);
-    };
-  }, [shown]);
+	useEffect(() => {
+		if (!shown) return undefined;
+		const drop = (/** @type {DragEvent} */ event) => {
+			if (!event.dataTransfer?.files.length) return;
+			event.preventDefault();
+			take(event.dataTransfer.files[0]);
+		};
+		const paste = (/** @type {ClipboardEvent} */ event) => {
+			take(Array.from(event.clipboardData?.files ?? []).find((file) => file.type.startsWith("image/")));
+		};
+		document.addEventListener("drop", drop);
+		document.addEventListener("paste", paste);
+		return () => {
+			document.removeEventListener("drop", drop);
+			document.removeEventListener("paste", paste);
+		};
+	}, [shown]);
 }
 
 /** @param {{file: File | null, isOpening: boolean}} props */
 function DropPlace({ file, isOpening }) {
-  const [isOver, setIsOver] = useState(false);
-  return html`<div
-    class=${isOver ? "drop over depth-drop" : "drop depth-drop"}
-    onDragEnter=${() => setIsOver(true)}
-    onDragLeave=${() => setIsOver(false)}
-    onDrop=${() => setIsOver(false)}
-  >
-    <p><strong>${file ? file.name : "Drop a photograph here, or paste one"}</strong></p>
-    <p class="hint">
-      ${file
-        ? isOpening
-          ? "Opening it ..."
-          : "This browser cannot show it; the service may still read it."
-        : "The whole frame as the camera stored it: a crop has lost its scale. It is read, and not kept."}
-    </p>
-  </div>`;
+	const [isOver, setIsOver] = useState(false);
+	return html`<div
+		class=${isOver ? "drop over depth-drop" : "drop depth-drop"}
+		onDragEnter=${() => setIsOver(true)}
+		onDragLeave=${() => setIsOver(false)}
+		onDrop=${() => setIsOver(false)}
+	>
+		<p><strong>${file ? file.name : "Drop a photograph here, or paste one"}</strong></p>
+		<p class="hint">
+			${file
+				? isOpening
+					? "Opening it ..."
+					: "This browser cannot show it; the service may still read it."
+				: "The whole frame as the camera stored it: a crop has lost its scale. It is read, and not kept."}
+		</p>
+	</div>`;
 }
 
 /** @param {{hasFile: boolean, onFile: (file: File | undefined) => void}} props */
 function FileButtons({ hasFile, onFile }) {
-  const chosen = useRef(/** @type {HTMLInputElement | null} */ (null));
-  const taken = useRef(/** @type {HTMLInputElement | null} */ (null));
-  const onChange = (/** @type {any} */ event) => {
-    onFile(event.target.files[0]);
-    event.target.value = ""; // the same file may be chosen again
-  };
-  return html`<div class="row depth-files">
-    <button type="button" class=${hasFile ? "" : "primary"} onClick=${() => chosen.current?.click()}>
-      ${hasFile ? "Another photograph" : "Choose a photograph"}
-    </button>
-    <button type="button" class="depth-take" onClick=${() => taken.current?.click()}>Take one</button>
-    <input ref=${chosen} type="file" accept=${PHOTOGRAPHS} hidden onChange=${onChange} />
-    <input ref=${taken} type="file" accept="image/*" capture="environment" hidden onChange=${onChange} />
-  </div>`;
+	const chosen = useRef(/** @type {HTMLInputElement | null} */ (null));
+	const taken = useRef(/** @type {HTMLInputElement | null} */ (null));
+	const onChange = (/** @type {any} */ event) => {
+		onFile(event.target.files[0]);
+		event.target.value = ""; // the same file may be chosen again
+	};
+	return html`<div class="row depth-files">
+		<button type="button" class=${hasFile ? "" : "primary"} onClick=${() => chosen.current?.click()}>
+			${hasFile ? "Another photograph" : "Choose a photograph"}
+		</button>
+		<button type="button" class="depth-take" onClick=${() => taken.current?.click()}>Take one</button>
+		<input ref=${chosen} type="file" accept=${PHOTOGRAPHS} hidden onChange=${onChange} />
+		<input ref=${taken} type="file" accept="image/*" capture="environment" hidden onChange=${onChange} />
+	</div>`;
 }
 
 /** @param {{camera: any, onFocusM: (focusM: number | null) => void}} props */
 function FocusField({ camera, onFocusM }) {
-  const [isWrong, setIsWrong] = useState(false);
-  return html`<label class="field"
-    >Focus distance of this shot, m
-    <input
-      type="number"
-      min="0.001"
-      step="any"
-      inputmode="decimal"
-      placeholder=${camera ? `${short(camera.focus_distance_m, 4)}, the camera's` : "the camera's"}
-      aria-invalid=${isWrong}
-      onChange=${(/** @type {any} */ event) => {
-        const { value, validity } = event.target;
-        setIsWrong(!validity.valid);
-        if (validity.valid) onFocusM(value === "" ? null : Number(value));
-      }}
-    />
-    ${isWrong && html`<span class="fault" role="alert">This is no distance in metres.</span>`}
-  </label>`;
+	const [isWrong, setIsWrong] = useState(false);
+	return html`<label class="field"
+		>Focus distance of this shot, m
+		<input
+			type="number"
+			min="0.001"
+			step="any"
+			inputmode="decimal"
+			placeholder=${camera ? `${short(camera.focus_distance_m, 4)}, the camera's` : "the camera's"}
+			aria-invalid=${isWrong}
+			onChange=${(/** @type {any} */ event) => {
+				const { value, validity } = event.target;
+				setIsWrong(!validity.valid);
+				if (validity.valid) onFocusM(value === "" ? null : Number(value));
+			}}
+		/>
+		${isWrong && html`<span class="fault" role="alert">This is no distance in metres.</span>`}
+	</label>`;
 }
 
 /** @param {{picture: string, onPicture: (picture: string) => void}} props */
 function PictureTabs({ picture, onPicture }) {
-  const tabs = [
-    ["photograph", "Picture"],
-    ["cloud", "3D"],
-  ];
-  const onKeyDown = (/** @type {KeyboardEvent} */ event) => {
-    if (!["ArrowLeft", "ArrowRight"].includes(event.key)) return;
-    event.preventDefault();
-    const [other] = /** @type {string[]} */ (tabs.find(([tab]) => tab !== picture));
-    onPicture(other);
-    document.getElementById(`depth-tab-${other}`)?.focus();
-  };
-  return html`<div class="depth-tabs" role="tablist" aria-label="Views of the depth" onKeyDown=${onKeyDown}>
-    ${tabs.map(
-      ([tab, title]) => html`<button
-        key=${tab}
-        type="button"
-        id=${`depth-tab-${tab}`}
-        role="tab"
-        aria-selected=${tab === picture}
-        aria-controls=${`depth-picture-${tab}`}
-        tabindex=${tab === picture ? 0 : -1}
-        onClick=${() => onPicture(tab)}
-      >
-        ${title}
-      </button>`,
-    )}
-  </div>`;
+	const tabs = [
+		["photograph", "Picture"],
+		["cloud", "3D"],
+	];
+	const onKeyDown = (/** @type {KeyboardEvent} */ event) => {
+		if (!["ArrowLeft", "ArrowRight"].includes(event.key)) return;
+		event.preventDefault();
+		const [other] = /** @type {string[]} */ (tabs.find(([tab]) => tab !== picture));
+		onPicture(other);
+		document.getElementById(`depth-tab-${other}`)?.focus();
+	};
+	return html`<div class="depth-tabs" role="tablist" aria-label="Views of the depth" onKeyDown=${onKeyDown}>
+		${tabs.map(
+			([tab, title]) => html`<button
+				key=${tab}
+				type="button"
+				id=${`depth-tab-${tab}`}
+				role="tab"
+				aria-selected=${tab === picture}
+				aria-controls=${`depth-picture-${tab}`}
+				tabindex=${tab === picture ? 0 : -1}
+				onClick=${() => onPicture(tab)}
+			>
+				${title}
+			</button>`,
+		)}
+	</div>`;
 }
 
 /** @param {{phase: Phase | null, onCancel: () => void}} props */
 function Progress({ phase, onCancel }) {
-  const [, tick] = useState(0);
-  const isWorking = phase?.step === "work";
-  useEffect(() => {
-    if (!isWorking) return undefined;
-    const timer = setInterval(() => tick((count) => count + 1), 100);
-    return () => clearInterval(timer);
-  }, [isWorking]);
-  if (phase === null) return null;
-  const says = {
-    upload: () => `Sending${phase.step === "upload" && phase.fraction ? ` ${Math.round(100 * phase.fraction)} %` : ""}`,
-    work: () =>
-      phase.step === "work" && `Waiting for a slot, reading the blur: ${((performance.now() - phase.since) / 1000).toFixed(1)} s`,
-    draw: () => "Drawing",
-  }[phase.step];
-  return html`<div class="depth-progress">
-    <progress
-      key=${phase.step}
-      aria-label="Progress"
-      value=${phase.step === "upload" && phase.fraction !== null ? phase.fraction : undefined}
-    ></progress>
-    <span class="number">${says()}</span>
-    <button type="button" onClick=${onCancel}>Cancel</button>
-  </div>`;
+	const [, tick] = useState(0);
+	const isWorking = phase?.step === "work";
+	useEffect(() => {
+		if (!isWorking) return undefined;
+		const timer = setInterval(() => tick((count) => count + 1), 100);
+		return () => clearInterval(timer);
+	}, [isWorking]);
+	if (phase === null) return null;
+	const says = {
+		upload: () => `Sending${phase.step === "upload" && phase.fraction ? ` ${Math.round(100 * phase.fraction)} %` : ""}`,
+		work: () =>
+			phase.step === "work" && `Waiting for a slot, reading the blur: ${((performance.now() - phase.since) / 1000).toFixed(1)} s`,
+		draw: () => "Drawing",
+	}[phase.step];
+	return html`<div class="depth-progress">
+		<progress
+			key=${phase.step}
+			aria-label="Progress"
+			value=${phase.step === "upload" && phase.fraction !== null ? phase.fraction : undefined}
+		></progress>
+		<span class="number">${says()}</span>
+		<button type="button" onClick=${onCancel}>Cancel</button>
+	</div>`;
 }
 
 /** @param {{texts: string[]}} props */
 function Warnings({ texts }) {
-  if (texts.length === 0) return null;
-  return html`<ul class="notice depth-warnings">
-    ${texts.map((text) => html`<li key=${text}>${text.replace(/^[a-z](?!\w*_)/, (one) => one.toUpperCase())}</li>`)}
-  </ul>`;
+	if (texts.length === 0) return null;
+	return html`<ul class="notice depth-warnings">
+		${texts.map((text) => html`<li key=${text}>${text.replace(/^[a-z](?!\w*_)/, (one) => one.toUpperCase())}</li>`)}
+	</ul>`;
 }
 
-/**
- * @param {string} text
- * @returns {"camera" | "focus" | "result"} beside what it should be read
- */
+/** @param {string} text @returns {"camera" | "focus" | "result"} beside what it should be read */
 function placeOfWarning(text) {
-  if (text.includes("focal length")) return "focus";
-  return text.includes("k_cam_px") ? "camera" : "result";
+	if (text.includes("focal length")) return "focus";
+	return text.includes("k_cam_px") ? "camera" : "result";
 }
 
 /** @param {any} camera */
 function about({ image_width_px, image_height_px, focus_distance_m, range_m, description }) {
-  const range = `reads up to ${short(range_m.far, 2)} m well`;
-  const numbers = `${image_width_px} × ${image_height_px} px, focused at ${short(focus_distance_m, 4)} m, ${range}`;
-  return description ? `${description}. ${numbers}` : numbers;
+	const range = `reads up to ${short(range_m.far, 2)} m well`;
+	const numbers = `${image_width_px} × ${image_height_px} px, focused at ${short(focus_distance_m, 4)} m, ${range}`;
+	return description ? `${description}. ${numbers}` : numbers;
 }
 
-/**
- * @param {string} header `decode;dur=1.2, wait;dur=0.1`
- * @returns {[string, number][]}
- */
+/** @param {string} header `decode;dur=1.2, wait;dur=0.1` @returns {[string, number][]} */
 function readTimings(header) {
-  return Array.from(header.matchAll(/([\w-]+);dur=([\d.]+)/g), ([, stage, ms]) => [stage, Number(ms)]);
+	return Array.from(header.matchAll(/([\w-]+);dur=([\d.]+)/g), ([, stage, ms]) => [stage, Number(ms)]);
 }
 
 /** @param {unknown} error */
 function unreadable(error) {
-  const detail = error instanceof Error ? error.message : String(error);
-  return new Problem({ status: 0, title: "The answer cannot be shown.", detail });
+	const detail = error instanceof Error ? error.message : String(error);
+	return new Problem({ status: 0, title: "The answer cannot be shown.", detail });
 }

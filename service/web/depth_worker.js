@@ -8,90 +8,90 @@ let maps = null;
 let photograph = null;
 
 function loaded() {
-  if (maps === null) throw new Error("No maps are loaded.");
-  return maps;
+	if (maps === null) throw new Error("No maps are loaded.");
+	return maps;
 }
 
 const WORK = {
-  /** @param {{npz: Blob}} about */
-  async load({ npz }) {
-    maps = null; // two photographs' maps at a time may be more than a phone has
-    maps = await DepthMaps.read(npz);
-    return maps.facts();
-  },
+	/** @param {{npz: Blob}} about */
+	async load({ npz }) {
+		maps = null; // two photographs' maps at a time may be more than a phone has
+		maps = await DepthMaps.read(npz);
+		return maps.facts();
+	},
 
-  /**
-   * @param {{file: Blob, mostPx: number}} about
-   * @returns {Promise<{bitmap: ImageBitmap, width: number, height: number} | null>} upright, at most so large on its
-   *   longer side, with its true size; null where the browser cannot read it
-   */
-  async photograph({ file, mostPx }) {
-    photograph = null;
-    const whole = await createImageBitmap(file).catch(() => null);
-    if (whole === null) return null;
-    const { width, height } = whole;
-    const scale = Math.min(1, mostPx / Math.max(width, height));
-    const canvas = new OffscreenCanvas(Math.round(width * scale) || 1, Math.round(height * scale) || 1);
-    const context = canvasContext(canvas);
-    context.imageSmoothingQuality = "high";
-    context.drawImage(whole, 0, 0, canvas.width, canvas.height);
-    whole.close();
-    photograph = context.getImageData(0, 0, canvas.width, canvas.height);
-    return { bitmap: canvas.transferToImageBitmap(), width, height };
-  },
+	/**
+	 * @param {{file: Blob, mostPx: number}} about
+	 * @returns {Promise<{bitmap: ImageBitmap, width: number, height: number} | null>} upright, at most so large on its
+	 *   longer side, with its true size; null where the browser cannot read it
+	 */
+	async photograph({ file, mostPx }) {
+		photograph = null;
+		const whole = await createImageBitmap(file).catch(() => null);
+		if (whole === null) return null;
+		const { width, height } = whole;
+		const scale = Math.min(1, mostPx / Math.max(width, height));
+		const canvas = new OffscreenCanvas(Math.round(width * scale) || 1, Math.round(height * scale) || 1);
+		const context = canvasContext(canvas);
+		context.imageSmoothingQuality = "high";
+		context.drawImage(whole, 0, 0, canvas.width, canvas.height);
+		whole.close();
+		photograph = context.getImageData(0, 0, canvas.width, canvas.height);
+		return { bitmap: canvas.transferToImageBitmap(), width, height };
+	},
 
-  /** @param {{look: import("./maps.js").Look, width: number, height: number}} about */
-  async paint({ look, width, height }) {
-    const { pixels, counts } = loaded().paint(look, width, height);
-    const canvas = new OffscreenCanvas(width, height);
-    canvasContext(canvas).putImageData(pixels, 0, 0);
-    return { bitmap: canvas.transferToImageBitmap(), counts };
-  },
+	/** @param {{look: import("./maps.js").Look, width: number, height: number}} about */
+	async paint({ look, width, height }) {
+		const { pixels, counts } = loaded().paint(look, width, height);
+		const canvas = new OffscreenCanvas(width, height);
+		canvasContext(canvas).putImageData(pixels, 0, 0);
+		return { bitmap: canvas.transferToImageBitmap(), counts };
+	},
 
-  /** @param {{u: number, v: number}} pixel */
-  async at({ u, v }) {
-    return loaded().at(u, v);
-  },
+	/** @param {{u: number, v: number}} pixel */
+	async at({ u, v }) {
+		return loaded().at(u, v);
+	},
 
-  /** @param {{from: {u: number, v: number}, to: {u: number, v: number}}} ends */
-  async distance({ from, to }) {
-    return loaded().distance(from, to);
-  },
+	/** @param {{from: {u: number, v: number}, to: {u: number, v: number}}} ends */
+	async distance({ from, to }) {
+		return loaded().distance(from, to);
+	},
 
-  /** @param {{most: number, look: import("./maps.js").Look, isPhotograph: boolean}} about */
-  async cloud({ most, look, isPhotograph }) {
-    return loaded().cloud(most, look, isPhotograph ? photograph : null);
-  },
+	/** @param {{most: number, look: import("./maps.js").Look, isPhotograph: boolean}} about */
+	async cloud({ most, look, isPhotograph }) {
+		return loaded().cloud(most, look, isPhotograph ? photograph : null);
+	},
 };
 
 /** @typedef {typeof WORK} Work */
 
 /** @param {OffscreenCanvas} canvas */
 function canvasContext(canvas) {
-  const context = canvas.getContext("2d", { willReadFrequently: true });
-  if (context === null) throw new Error("This browser gives a worker no canvas.");
-  return context;
+	const context = canvas.getContext("2d", { willReadFrequently: true });
+	if (context === null) throw new Error("This browser gives a worker no canvas.");
+	return context;
 }
 
 /** @param {any} result */
 function transferable(result) {
-  return [result?.bitmap, result?.positions?.buffer, result?.colours?.buffer].filter(Boolean);
+	return [result?.bitmap, result?.positions?.buffer, result?.colours?.buffer].filter(Boolean);
 }
 
 const scope = /** @type {Worker} */ (/** @type {unknown} */ (globalThis));
 
 /** @param {MessageEvent} message */
 async function answer({ data: { id, kind, about } }) {
-  try {
-    const result = await WORK[/** @type {keyof Work} */ (kind)](about);
-    scope.postMessage({ id, result }, transferable(result));
-  } catch (error) {
-    scope.postMessage({ id, failure: error instanceof Error ? error.message : String(error) });
-  }
+	try {
+		const result = await WORK[/** @type {keyof Work} */ (kind)](about);
+		scope.postMessage({ id, result }, transferable(result));
+	} catch (error) {
+		scope.postMessage({ id, failure: error instanceof Error ? error.message : String(error) });
+	}
 }
 
 // one after the other, so that nothing is read from maps that another photograph's are about to replace
 let before = Promise.resolve();
 scope.onmessage = (message) => {
-  before = before.then(() => answer(message));
+	before = before.then(() => answer(message));
 };

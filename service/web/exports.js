@@ -9,69 +9,69 @@ import { html, useState } from "./vendor/preact.js";
 
 /** @param {{result: import("./depth.js").Result, announce: (text: string) => void}} props */
 export function Exports({ result: { asked, file, npz }, announce }) {
-  const [format, setFormat] = useState("png");
-  const [isBusy, setIsBusy] = useState(false);
-  const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
-  const [copied, setCopied] = useState(/** @type {{text: string, isCopied: boolean} | null} */ (null));
-  const path = depthPath({ ...asked, format });
-  const mediaType = mediaTypeOf(file);
-  const answer = answerName(file.name, format);
+	const [format, setFormat] = useState("png");
+	const [isBusy, setIsBusy] = useState(false);
+	const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
+	const [copied, setCopied] = useState(/** @type {{text: string, isCopied: boolean} | null} */ (null));
+	const path = depthPath({ ...asked, format });
+	const mediaType = mediaTypeOf(file);
+	const answer = answerName(file.name, format);
 
-  async function download() {
-    setIsBusy(true);
-    setProblem(null);
-    try {
-      save(format === "npz" ? npz : await fetched(), answer);
-      announce(`${answer} is downloaded.`);
-    } catch (error) {
-      setProblem(problemOf(error));
-    } finally {
-      setIsBusy(false);
-    }
-  }
+	async function download() {
+		setIsBusy(true);
+		setProblem(null);
+		try {
+			save(format === "npz" ? npz : await fetched(), answer);
+			announce(`${answer} is downloaded.`);
+		} catch (error) {
+			setProblem(problemOf(error));
+		} finally {
+			setIsBusy(false);
+		}
+	}
 
-  // the service keeps no photograph: it is sent again
-  const fetched = () => getBlob(path, { method: "POST", body: file, headers: { "Content-Type": mediaType } });
+	// the service keeps no photograph: it is sent again
+	const fetched = () => getBlob(path, { method: "POST", body: file, headers: { "Content-Type": mediaType } });
 
-  /** @param {typeof curlCommand} write */
-  async function copy(write) {
-    const url = new URL(path, document.baseURI).href;
-    const text = write({ url, photograph: file.name, mediaType, answer, hasKey: storedKey() !== null });
-    let isCopied = true;
-    try {
-      await navigator.clipboard.writeText(text);
-    } catch {
-      isCopied = false; // without TLS a browser gives nobody the clipboard
-    }
-    setCopied({ text, isCopied });
-    announce(isCopied ? "Copied." : "The browser did not allow copying: the command is below.");
-  }
+	/** @param {typeof curlCommand} write */
+	async function copy(write) {
+		const url = new URL(path, document.baseURI).href;
+		const text = write({ url, photograph: file.name, mediaType, answer, hasKey: storedKey() !== null });
+		let isCopied = true;
+		try {
+			await navigator.clipboard.writeText(text);
+		} catch {
+			isCopied = false; // without TLS a browser gives nobody the clipboard
+		}
+		setCopied({ text, isCopied });
+		announce(isCopied ? "Copied." : "The browser did not allow copying: the command is below.");
+	}
 
-  return html`<section class="card stack" aria-label="Take it along">
-    <h3>Take it along</h3>
-    <label class="field"
-      >Format
-      <select
-        value=${format}
-        onChange=${(/** @type {any} */ event) => {
-          setFormat(event.target.value);
-          setCopied(null);
-        }}
-      >
-        ${Object.entries(FORMATS).map(([value, { says }]) => html`<option key=${value} value=${value}>${says}</option>`)}
-      </select>
-    </label>
-    <div class="row">
-      <button type="button" disabled=${isBusy} onClick=${download}>${isBusy ? "Asking…" : "Download"}</button>
-      <button type="button" onClick=${() => copy(curlCommand)}>Copy as curl</button>
-      <button type="button" onClick=${() => copy(pythonCommand)}>Copy as Python</button>
-    </div>
-    <${ProblemBox} problem=${problem} onClose=${() => setProblem(null)} />
-    ${copied &&
-    html`<p class="hint">
-        ${copied.isCopied ? "Copied." : "Copy it from here."} To be run in the photograph's
-        folder${storedKey() !== null && ", with the API key in CAMIND_API_KEY"}.
-      </p>
-      <pre class="depth-command" tabindex="0" aria-label="Command">${copied.text}</pre>`}
-  </section>`;
+	return html`<section class="card stack" aria-label="Take it along">
+		<h3>Take it along</h3>
+		<label class="field"
+			>Format
+			<select
+				value=${format}
+				onChange=${(/** @type {any} */ event) => {
+					setFormat(event.target.value);
+					setCopied(null);
+				}}
+			>
+				${Object.entries(FORMATS).map(([value, { says }]) => html`<option key=${value} value=${value}>${says}</option>`)}
+			</select>
+		</label>
+		<div class="row">
+			<button type="button" disabled=${isBusy} onClick=${download}>${isBusy ? "Asking…" : "Download"}</button>
+			<button type="button" onClick=${() => copy(curlCommand)}>Copy as curl</button>
+			<button type="button" onClick=${() => copy(pythonCommand)}>Copy as Python</button>
+		</div>
+		<${ProblemBox} problem=${problem} onClose=${() => setProblem(null)} />
+		${copied &&
+		html`<p class="hint">
+				${copied.isCopied ? "Copied." : "Copy it from here."} To be run in the photograph's
+				folder${storedKey() !== null && ", with the API key in CAMIND_API_KEY"}.
+			</p>
+			<pre class="depth-command" tabindex="0" aria-label="Command">${copied.text}</pre>`}
+	</section>`;
 }

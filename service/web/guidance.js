@@ -37,8 +37,8 @@ const FARTHER = [1.25, 1.7];
  * @param {number} height
  */
 export function upright(x, y, orientation, width, height) {
-  const [left, up] = [width - x, height - y];
-  return /** @type {[number, number][]} */ ([[x, y], [left, y], [left, up], [x, up], [y, x], [up, x], [up, left], [y, left]])[orientation - 1];
+	const [left, up] = [width - x, height - y];
+	return /** @type {[number, number][]} */ ([[x, y], [left, y], [left, up], [x, up], [y, x], [up, x], [up, left], [y, left]])[orientation - 1];
 }
 
 /**
@@ -48,102 +48,83 @@ export function upright(x, y, orientation, width, height) {
  * @returns {number[][]} rows of columns
  */
 export function coverageOf(seen) {
-  const cells = Array.from({ length: ROWS }, () => Array(COLUMNS).fill(0));
-  const place = (/** @type {number} */ at, /** @type {number} */ size, /** @type {number} */ count) =>
-    Math.min(count - 1, Math.max(0, Math.floor(((at + 0.5) / size) * count)));
-  for (const { circles, width, height } of seen) {
-    for (const { u_px: u, v_px: v } of circles) cells[place(v, height, ROWS)][place(u, width, COLUMNS)] += 1;
-  }
-  const orientation = seen[seen.length - 1]?.orientation ?? 1;
-  if (orientation === 1) return cells;
-  const [rows, columns] = orientation > 4 ? [COLUMNS, ROWS] : [ROWS, COLUMNS];
-  const shown = Array.from({ length: rows }, () => Array(columns).fill(0));
-  cells.forEach((row, down) =>
-    row.forEach((count, across) => {
-      const [x, y] = upright(across + 0.5, down + 0.5, orientation, COLUMNS, ROWS);
-      shown[Math.floor(y)][Math.floor(x)] = count;
-    }),
-  );
-  return shown;
+	const orientation = seen[seen.length - 1]?.orientation ?? 1;
+	const isTurned = orientation > 4;
+	const [rows, columns] = isTurned ? [COLUMNS, ROWS] : [ROWS, COLUMNS];
+	const cells = Array.from({ length: rows }, () => Array(columns).fill(0));
+	const place = (/** @type {number} */ at, /** @type {number} */ size, /** @type {number} */ count) =>
+		Math.min(count - 1, Math.max(0, Math.floor((at / size) * count)));
+	for (const { circles, width, height } of seen) {
+		const [across, down] = isTurned ? [height, width] : [width, height];
+		for (const { u_px: u, v_px: v } of circles) {
+			const [x, y] = upright(u + 0.5, v + 0.5, orientation, width, height);
+			cells[place(y, down, rows)][place(x, across, columns)] += 1;
+		}
+	}
+	return cells;
 }
 
-/**
- * Where the lens seems to be focused: as told, else the distance of the sharpest photograph.
- *
- * @param {Seen[]} seen
- * @param {number | null} told
- */
+/** Where the lens seems to be focused: as told, else the distance of the sharpest photograph. @param {Seen[]} seen @param {number | null} told */
 export function focusOf(seen, told) {
-  if (told !== null) return told;
-  const known = seen.filter(({ role, blur, distance }) => role === "defocused" && blur !== null && distance !== null);
-  known.sort((a, b) => Number(a.blur) - Number(b.blur));
-  return known[0]?.distance ?? null;
+	if (told !== null) return told;
+	const known = seen.filter(({ role, blur, distance }) => role === "defocused" && blur !== null && distance !== null);
+	known.sort((a, b) => Number(a.blur) - Number(b.blur));
+	return known[0]?.distance ?? null;
 }
 
-/**
- * @param {Seen[]} seen
- * @param {number | null} toldFocus in metres
- * @returns {string}
- */
+/** @param {Seen[]} seen @param {number | null} toldFocus in metres @returns {string} */
 export function adviceFor(seen, toldFocus) {
-  const left = WANTED - seen.length;
-  const tilted = seen.filter(({ tilt }) => tilt !== null && tilt >= TILTED_DEG).length;
-  const tilt = tilted < WANTED_TILTED ? ", tilted by 15 to 25 degrees" : "";
-  if (seen.length === 0) {
-    return "Begin with one in which the sheet is sharp and fills most of the frame.";
-  }
-  const side = missingSide(seen, focusOf(seen, toldFocus));
-  if (side) return `Next: one ${side}${tilt}.`;
-  const corner = missingCorner(coverageOf(seen));
-  if (corner && (left > 0 || seen.length < WANTED + 4)) {
-    return `Next: one with the sheet towards the ${corner}${tilt}.`;
-  }
-  if (tilt && seen.some((one) => one.tilt !== null)) return `Next: one${tilt}.`;
-  if (left > 0) return `Next: ${left === 1 ? "one more" : `${left} more`}, each at another distance and tilt.`;
-  return "This is a good set: start the calibration.";
+	const left = WANTED - seen.length;
+	const tilted = seen.filter(({ tilt }) => tilt !== null && tilt >= TILTED_DEG).length;
+	const tilt = tilted < WANTED_TILTED ? ", tilted by 15 to 25 degrees" : "";
+	if (seen.length === 0) {
+		return "Begin with one in which the sheet is sharp and fills most of the frame.";
+	}
+	const side = missingSide(seen, focusOf(seen, toldFocus));
+	if (side) return `Next: one ${side}${tilt}.`;
+	const corner = missingCorner(coverageOf(seen));
+	if (corner && (left > 0 || seen.length < WANTED + 4)) {
+		return `Next: one with the sheet towards the ${corner}${tilt}.`;
+	}
+	if (tilt && seen.some((one) => one.tilt !== null)) return `Next: one${tilt}.`;
+	if (left > 0) return `Next: ${left === 1 ? "one more" : `${left} more`}, each at another distance and tilt.`;
+	return "This is a good set: start the calibration.";
 }
 
-/**
- * @param {Seen[]} seen
- * @param {number | null} focus in metres
- * @returns {string | null} where too few were taken
- */
+/** @param {Seen[]} seen @param {number | null} focus in metres @returns {string | null} where too few were taken */
 function missingSide(seen, focus) {
-  const defocused = seen.filter(({ role }) => role === "defocused");
-  const distances = defocused.flatMap(({ distance }) => (distance === null ? [] : [distance]));
-  if (focus === null || distances.length === 0) {
-    // without a focal length there is no distance, but the sheet's size in the frame tells near from far
-    const sizes = defocused.map(sizeOf).sort((a, b) => a - b);
-    if (sizes.length > 0 && sizes[sizes.length - 1] > sizes[0] * SIDE ** 2) return null;
-    return sizes.length % 2 === 0 ? "nearer than the plane in focus" : "farther than the plane in focus";
-  }
-  const at = (/** @type {Between} */ [low, high]) => `at ${short(focus * low, 2)}–${short(focus * high, 2)} m`;
-  const nearer = distances.filter((distance) => distance < focus / SIDE).length;
-  const farther = distances.filter((distance) => distance > focus * SIDE).length;
-  if (nearer < WANTED_A_SIDE && nearer <= farther) return at(NEARER);
-  if (farther < WANTED_A_SIDE) return at(FARTHER);
-  return nearer < WANTED_A_SIDE ? at(NEARER) : null;
+	const defocused = seen.filter(({ role }) => role === "defocused");
+	const distances = defocused.flatMap(({ distance }) => (distance === null ? [] : [distance]));
+	if (focus === null || distances.length === 0) {
+		// without a focal length there is no distance, but the sheet's size in the frame tells near from far
+		const sizes = defocused.map(sizeOf).sort((a, b) => a - b);
+		if (sizes.length > 0 && sizes[sizes.length - 1] > sizes[0] * SIDE ** 2) return null;
+		return sizes.length % 2 === 0 ? "nearer than the plane in focus" : "farther than the plane in focus";
+	}
+	const at = (/** @type {Between} */ [low, high]) => `at ${short(focus * low, 2)}–${short(focus * high, 2)} m`;
+	const nearer = distances.filter((distance) => distance < focus / SIDE).length;
+	const farther = distances.filter((distance) => distance > focus * SIDE).length;
+	if (nearer < WANTED_A_SIDE && nearer <= farther) return at(NEARER);
+	if (farther < WANTED_A_SIDE) return at(FARTHER);
+	return nearer < WANTED_A_SIDE ? at(NEARER) : null;
 }
 
 /** @param {Seen} seen the circles' diagonal as a part of the frame's width */
 function sizeOf({ circles, width }) {
-  const across = circles.map(({ u_px: u }) => u);
-  const down = circles.map(({ v_px: v }) => v);
-  return Math.hypot(Math.max(...across) - Math.min(...across), Math.max(...down) - Math.min(...down)) / width;
+	const across = circles.map(({ u_px: u }) => u);
+	const down = circles.map(({ v_px: v }) => v);
+	return Math.hypot(Math.max(...across) - Math.min(...across), Math.max(...down) - Math.min(...down)) / width;
 }
 
-/**
- * @param {number[][]} cells
- * @returns {string | null} the first corner without a circle
- */
+/** @param {number[][]} cells @returns {string | null} the first corner without a circle */
 function missingCorner(cells) {
-  const [top, bottom, last] = [cells[0], cells[cells.length - 1], cells[0].length - 1];
-  const corners = /** @type {[string, number[], number[]][]} */ ([
-    ["upper left corner", top, [0, 1]],
-    ["upper right corner", top, [last - 1, last]],
-    ["lower left corner", bottom, [0, 1]],
-    ["lower right corner", bottom, [last - 1, last]],
-  ]);
-  const found = corners.find(([, row, columns]) => columns.every((column) => row[column] === 0));
-  return found ? found[0] : null;
+	const [top, bottom, last] = [cells[0], cells[cells.length - 1], cells[0].length - 1];
+	const corners = /** @type {[string, number[], number[]][]} */ ([
+		["upper left corner", top, [0, 1]],
+		["upper right corner", top, [last - 1, last]],
+		["lower left corner", bottom, [0, 1]],
+		["lower right corner", bottom, [last - 1, last]],
+	]);
+	const found = corners.find(([, row, columns]) => columns.every((column) => row[column] === 0));
+	return found ? found[0] : null;
 }

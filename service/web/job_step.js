@@ -14,52 +14,52 @@ const SPREADS = { disc: "a disc", gaussian: "a Gaussian" };
 
 /** @param {{job: any}} props */
 export function Running({ job }) {
-  const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
+	const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
 
-  async function cancel() {
-    try {
-      await request(`calibrations/${job.id}`, { method: "DELETE" });
-    } catch (error) {
-      setProblem(problemOf(error));
-    }
-  }
+	async function cancel() {
+		try {
+			await request(`calibrations/${job.id}`, { method: "DELETE" });
+		} catch (error) {
+			setProblem(problemOf(error));
+		}
+	}
 
-  const percent = Math.round(job.progress * 100);
-  return html`
-    <div class="card">
-      <div class="row ends">
-        <h3>${job.state === "queued" ? `The calibration of ${job.camera} waits` : `Calibrating ${job.camera}`}</h3>
-        <button type="button" class="danger" onClick=${cancel}>Cancel</button>
-      </div>
-      <progress max="1" value=${job.progress} aria-label="Progress of the calibration"></progress>
-      <p class="hint">
-        ${job.state === "queued" ? "Another one runs first. " : `${percent} %. `} It goes on when this page is closed: it is listed
-        below then.
-      </p>
-      <${ProblemBox} problem=${problem} />
-      <${Images} images=${job.images} />
-    </div>
-  `;
+	const percent = Math.round(job.progress * 100);
+	return html`
+		<div class="card">
+			<div class="row ends">
+				<h3>${job.state === "queued" ? `The calibration of ${job.camera} waits` : `Calibrating ${job.camera}`}</h3>
+				<button type="button" class="danger" onClick=${cancel}>Cancel</button>
+			</div>
+			<progress max="1" value=${job.progress} aria-label="Progress of the calibration"></progress>
+			<p class="hint">
+				${job.state === "queued" ? "Another one runs first. " : `${percent} %. `} It goes on when this page is closed: it is listed
+				below then.
+			</p>
+			<${ProblemBox} problem=${problem} />
+			<${Images} images=${job.images} />
+		</div>
+	`;
 }
 
 /** @param {{images: any[]}} props what each photograph gave */
 function Images({ images }) {
-  if (images.length === 0) return null;
-  return html`
-    <${Table} label="Photographs" head=${["Photograph", "Grid", "Circles", "Blur", "Distance", "Tilt", "Remarks"]} numbers=${[2, 3, 4, 5]}>
-      ${images.map(
-        (one) => html`<tr key=${one.name}>
-          <th scope="row" class="file" title=${ROLES[/** @type {keyof typeof ROLES} */ (one.role)]}>${one.name}</th>
-          <td><span class=${`badge ${one.found ? "good" : "bad"}`}>${one.found ? "found" : "not found"}</span></td>
-          <td class="number">${one.circles}</td>
-          <td class="number">${measure(one.blur_px, " px")}</td>
-          <td class="number">${measure(one.distance_m, " m")}</td>
-          <td class="number">${measure(one.tilt_deg, "°", 2)}</td>
-          <td class="hint">${one.warnings.join("; ")}</td>
-        </tr>`,
-      )}
-    <//>
-  `;
+	if (images.length === 0) return null;
+	return html`
+		<${Table} label="Photographs" head=${["Photograph", "Grid", "Circles", "Blur", "Distance", "Tilt", "Remarks"]} numbers=${[2, 3, 4, 5]}>
+			${images.map(
+				(one) => html`<tr key=${one.name}>
+					<th scope="row" class="file" title=${ROLES[/** @type {keyof typeof ROLES} */ (one.role)]}>${one.name}</th>
+					<td><span class=${`badge ${one.found ? "good" : "bad"}`}>${one.found ? "found" : "not found"}</span></td>
+					<td class="number">${one.circles}</td>
+					<td class="number">${measure(one.blur_px, " px")}</td>
+					<td class="number">${measure(one.distance_m, " m")}</td>
+					<td class="number">${measure(one.tilt_deg, "°", 2)}</td>
+					<td class="hint">${one.warnings.join("; ")}</td>
+				</tr>`,
+			)}
+		<//>
+	`;
 }
 
 /**
@@ -67,68 +67,68 @@ function Images({ images }) {
  *   onAgain: () => void, go: import("./app.js").ViewProps["go"]}} props
  */
 export function Ended({ job, cameras, onAccepted, onDiscard, onAgain, go }) {
-  if (job.result === null) {
-    return html`
-      <div class="card">
-        <h3>${job.state === "cancelled" ? "The calibration was cancelled" : "The calibration found no camera"}</h3>
-        ${job.problem && html`<div class="problem" role="alert"><p>${job.problem}</p></div>`}
-        <${Images} images=${job.images} />
-        <div class="row"><button type="button" class="primary" onClick=${onAgain}>Back to the photographs</button></div>
-      </div>
-    `;
-  }
-  const { result } = job;
-  const outliers = result.samples.filter((/** @type {any} */ sample) => !sample.used);
-  return html`
-    <div class="stack">
-      <div class="card">
-        <h3>What was found for ${job.camera}</h3>
-        <dl class="figures">
-          <${Constant} name="k_cam" unit="px" of=${result.k_cam_px} />
-          <${Constant} name="gamma" unit="px" of=${result.gamma_px} />
-          <${Constant} name="Focus distance" unit="m" of=${result.focus_distance_m} />
-        </dl>
-        ${result.warnings.length > 0 &&
-        html`<ul class="notice plain">${result.warnings.map((/** @type {string} */ words) => html`<li>${words}</li>`)}</ul>`}
-        <${Accept} job=${job} cameras=${cameras} onAccepted=${onAccepted} onDiscard=${onDiscard} go=${go} />
-      </div>
-      <div class="columns">
-        <div class="card"><${Fit} result=${result} /></div>
-        <div class="card"><${Residuals} result=${result} /></div>
-      </div>
-      <div class="card">
-        <h3>Lens</h3>
-        <dl class="facts">
-          <dt>Image</dt><dd>${result.image_width_px} × ${result.image_height_px} px</dd>
-          <dt>fx, fy</dt><dd>${short(result.intrinsics.fx_px, 5)}, ${short(result.intrinsics.fy_px, 5)} px</dd>
-          <dt>cx, cy</dt><dd>${short(result.intrinsics.cx_px, 5)}, ${short(result.intrinsics.cy_px, 5)} px</dd>
-          <dt>Distortion</dt><dd>${result.intrinsics.distortion.map((/** @type {number} */ term) => short(term)).join(", ") || "none"}</dd>
-          <dt>Reprojection error</dt><dd>${short(result.reprojection_rms_px)} px rms</dd>
-          <dt>Point spread</dt><dd>${SPREADS[/** @type {keyof typeof SPREADS} */ (result.point_spread)]}</dd>
-          <dt>Corners</dt>
-          <dd>${result.corner_ratio === null ? "too few circles there" : `k_cam is ${short(result.corner_ratio)} times that of the middle`}</dd>
-        </dl>
-        <details>
-          <summary>${counted(outliers.length, "outlier")} of ${counted(result.samples.length, "circle")}</summary>
-          <${Outliers} outliers=${outliers} />
-        </details>
-        <details>
-          <summary>${counted(job.images.length, "photograph")}</summary>
-          <${Images} images=${job.images} />
-        </details>
-      </div>
-    </div>
-  `;
+	if (job.result === null) {
+		return html`
+			<div class="card">
+				<h3>${job.state === "cancelled" ? "The calibration was cancelled" : "The calibration found no camera"}</h3>
+				${job.problem && html`<div class="problem" role="alert"><p>${job.problem}</p></div>`}
+				<${Images} images=${job.images} />
+				<div class="row"><button type="button" class="primary" onClick=${onAgain}>Back to the photographs</button></div>
+			</div>
+		`;
+	}
+	const { result } = job;
+	const outliers = result.samples.filter((/** @type {any} */ sample) => !sample.used);
+	return html`
+		<div class="stack">
+			<div class="card">
+				<h3>What was found for ${job.camera}</h3>
+				<dl class="figures">
+					<${Constant} name="k_cam" unit="px" of=${result.k_cam_px} />
+					<${Constant} name="gamma" unit="px" of=${result.gamma_px} />
+					<${Constant} name="Focus distance" unit="m" of=${result.focus_distance_m} />
+				</dl>
+				${result.warnings.length > 0 &&
+				html`<ul class="notice plain">${result.warnings.map((/** @type {string} */ words) => html`<li>${words}</li>`)}</ul>`}
+				<${Accept} job=${job} cameras=${cameras} onAccepted=${onAccepted} onDiscard=${onDiscard} go=${go} />
+			</div>
+			<div class="columns">
+				<div class="card"><${Fit} result=${result} /></div>
+				<div class="card"><${Residuals} result=${result} /></div>
+			</div>
+			<div class="card">
+				<h3>Lens</h3>
+				<dl class="facts">
+					<dt>Image</dt><dd>${result.image_width_px} × ${result.image_height_px} px</dd>
+					<dt>fx, fy</dt><dd>${short(result.intrinsics.fx_px, 5)}, ${short(result.intrinsics.fy_px, 5)} px</dd>
+					<dt>cx, cy</dt><dd>${short(result.intrinsics.cx_px, 5)}, ${short(result.intrinsics.cy_px, 5)} px</dd>
+					<dt>Distortion</dt><dd>${result.intrinsics.distortion.map((/** @type {number} */ term) => short(term)).join(", ") || "none"}</dd>
+					<dt>Reprojection error</dt><dd>${short(result.reprojection_rms_px)} px rms</dd>
+					<dt>Point spread</dt><dd>${SPREADS[/** @type {keyof typeof SPREADS} */ (result.point_spread)]}</dd>
+					<dt>Corners</dt>
+					<dd>${result.corner_ratio === null ? "too few circles there" : `k_cam is ${short(result.corner_ratio)} times that of the middle`}</dd>
+				</dl>
+				<details>
+					<summary>${counted(outliers.length, "outlier")} of ${counted(result.samples.length, "circle")}</summary>
+					<${Outliers} outliers=${outliers} />
+				</details>
+				<details>
+					<summary>${counted(job.images.length, "photograph")}</summary>
+					<${Images} images=${job.images} />
+				</details>
+			</div>
+		</div>
+	`;
 }
 
 /** @param {{name: string, unit: string, of: {value: number, low: number, high: number}}} props */
 function Constant({ name, unit, of: { value, low, high } }) {
-  const words = low === high ? "as given" : `${short(low, 4)} to ${short(high, 4)} at 95 %`;
-  return html`<div>
-    <dt>${name}</dt>
-    <dd>${short(value, 4)} <small>${unit}</small></dd>
-    <dd class="interval">${words}</dd>
-  </div>`;
+	const words = low === high ? "as given" : `${short(low, 4)} to ${short(high, 4)} at 95 %`;
+	return html`<div>
+		<dt>${name}</dt>
+		<dd>${short(value, 4)} <small>${unit}</small></dd>
+		<dd class="interval">${words}</dd>
+	</div>`;
 }
 
 /** @param {any} sample */
@@ -136,140 +136,131 @@ const told = (sample) => `${sample.image}, circle ${sample.circle}`;
 
 /** @param {any[]} samples evenly fewer, where they are very many */
 function thinned(samples) {
-  const every = Math.ceil(samples.length / MOST_DOTS);
-  return samples.filter((_, number) => number % every === 0);
+	const every = Math.ceil(samples.length / MOST_DOTS);
+	return samples.filter((_, number) => number % every === 0);
 }
 
 /** @param {{result: any}} props */
 function Fit({ result: { samples, curve, focus_distance_m: focus } }) {
-  const dots = (/** @type {boolean} */ used) =>
-    thinned(samples.filter((/** @type {any} */ sample) => sample.used === used)).map((/** @type {any} */ sample) => ({
-      x: sample.depth_m,
-      y: sample.blur_px,
-      label: told(sample),
-    }));
-  const along = curve.map((/** @type {any} */ at) => ({ x: at.depth_m, y: at.blur_px, low: at.low_px, high: at.high_px }));
-  return html`<${Chart}
-    title="Blur of every circle"
-    x=${{ label: "distance", unit: "m", isLog: true }}
-    y=${{ label: "blur", unit: "px", from: 0 }}
-    marks=${[{ x: focus.value, label: "in focus" }]}
-    series=${[
-      { name: "95 %", kind: "band", tone: "two", points: along },
-      { name: "circles", kind: "dots", tone: "one", points: dots(true) },
-      { name: "outliers", kind: "dots", tone: "three", points: dots(false) },
-      { name: "fit", kind: "line", tone: "two", points: along },
-    ].filter(({ points }) => points.length > 0)}
-  />`;
+	const dots = (/** @type {boolean} */ used) =>
+		thinned(samples.filter((/** @type {any} */ sample) => sample.used === used)).map((/** @type {any} */ sample) => ({
+			x: sample.depth_m,
+			y: sample.blur_px,
+			label: told(sample),
+		}));
+	const along = curve.map((/** @type {any} */ at) => ({ x: at.depth_m, y: at.blur_px, low: at.low_px, high: at.high_px }));
+	return html`<${Chart}
+		title="Blur of every circle"
+		x=${{ label: "distance", unit: "m", isLog: true }}
+		y=${{ label: "blur", unit: "px", from: 0 }}
+		marks=${[{ x: focus.value, label: "in focus" }]}
+		series=${[
+			{ name: "95 %", kind: "band", tone: "two", points: along },
+			{ name: "circles", kind: "dots", tone: "one", points: dots(true) },
+			{ name: "outliers", kind: "dots", tone: "three", points: dots(false) },
+			{ name: "fit", kind: "line", tone: "two", points: along },
+		].filter(({ points }) => points.length > 0)}
+	/>`;
 }
 
 /** @param {{result: any}} props */
 function Residuals({ result: { samples, curve } }) {
-  const used = thinned(samples.filter((/** @type {any} */ sample) => sample.used));
-  const points = used.flatMap((/** @type {any} */ sample) => {
-    const fitted = curveAt(curve, sample.depth_m);
-    return fitted === null ? [] : [{ x: sample.depth_m, y: sample.blur_px - fitted, label: told(sample) }];
-  });
-  const most = Math.max(0.05, ...points.map(({ y }) => Math.abs(y)));
-  return html`<${Chart}
-    title="What the fit leaves"
-    x=${{ label: "distance", unit: "m", isLog: true }}
-    y=${{ label: "measured less fitted", unit: "px", from: -most, to: most }}
-    series=${[{ name: "", kind: "dots", tone: "one", points }]}
-  />`;
+	const used = thinned(samples.filter((/** @type {any} */ sample) => sample.used));
+	const points = used.flatMap((/** @type {any} */ sample) => {
+		const fitted = curveAt(curve, sample.depth_m);
+		return fitted === null ? [] : [{ x: sample.depth_m, y: sample.blur_px - fitted, label: told(sample) }];
+	});
+	const most = Math.max(0.05, ...points.map(({ y }) => Math.abs(y)));
+	return html`<${Chart}
+		title="What the fit leaves"
+		x=${{ label: "distance", unit: "m", isLog: true }}
+		y=${{ label: "measured less fitted", unit: "px", from: -most, to: most }}
+		series=${[{ name: "", kind: "dots", tone: "one", points }]}
+	/>`;
 }
 
-/**
- * The service's curve between two of its points.
- *
- * @param {any[]} curve
- * @param {number} depth
- * @returns {number | null}
- */
+/** The service's curve between two of its points. @param {any[]} curve @param {number} depth @returns {number | null} */
 function curveAt(curve, depth) {
-  const after = curve.findIndex(({ depth_m: at }) => at >= depth);
-  if (after < 1) return null;
-  const [from, to] = [curve[after - 1], curve[after]];
-  const part = (depth - from.depth_m) / (to.depth_m - from.depth_m);
-  return from.blur_px + part * (to.blur_px - from.blur_px);
+	const after = curve.findIndex(({ depth_m: at }) => at >= depth);
+	if (after < 1) return null;
+	const [from, to] = [curve[after - 1], curve[after]];
+	const part = (depth - from.depth_m) / (to.depth_m - from.depth_m);
+	return from.blur_px + part * (to.blur_px - from.blur_px);
 }
 
 /** @param {{outliers: any[]}} props */
 function Outliers({ outliers }) {
-  if (outliers.length === 0) return html`<p class="hint">Every circle fits.</p>`;
-  return html`
-    <${Table} label="Outliers" head=${["Photograph", "Circle", "At u, v (px)", "Distance (m)", "Blur (px)"]} numbers=${[1, 2, 3, 4]}>
-      ${outliers.slice(0, MOST_OUTLIERS).map(
-        (one) => html`<tr>
-          <th scope="row" class="file">${one.image}</th>
-          <td class="number">${one.circle}</td>
-          <td class="number">${Math.round(one.u_px)}, ${Math.round(one.v_px)}</td>
-          <td class="number">${short(one.depth_m)}</td>
-          <td class="number">${short(one.blur_px)}</td>
-        </tr>`,
-      )}
-    <//>
-    ${outliers.length > MOST_OUTLIERS && html`<p class="hint">and ${outliers.length - MOST_OUTLIERS} more</p>`}
-  `;
+	if (outliers.length === 0) return html`<p class="hint">Every circle fits.</p>`;
+	return html`
+		<${Table} label="Outliers" head=${["Photograph", "Circle", "At u, v (px)", "Distance (m)", "Blur (px)"]} numbers=${[1, 2, 3, 4]}>
+			${outliers.slice(0, MOST_OUTLIERS).map(
+				(one) => html`<tr>
+					<th scope="row" class="file">${one.image}</th>
+					<td class="number">${one.circle}</td>
+					<td class="number">${Math.round(one.u_px)}, ${Math.round(one.v_px)}</td>
+					<td class="number">${short(one.depth_m)}</td>
+					<td class="number">${short(one.blur_px)}</td>
+				</tr>`,
+			)}
+		<//>
+		${outliers.length > MOST_OUTLIERS && html`<p class="hint">and ${outliers.length - MOST_OUTLIERS} more</p>`}
+	`;
 }
 
-/**
- * @param {{job: any, cameras: any[] | null, onAccepted: (job: any) => void, onDiscard: () => void,
- *   go: import("./app.js").ViewProps["go"]}} props
- */
+/** @param {{job: any, cameras: any[] | null, onAccepted: (job: any) => void, onDiscard: () => void, go: import("./app.js").ViewProps["go"]}} props */
 function Accept({ job, cameras, onAccepted, onDiscard, go }) {
-  const [name, setName] = useState(job.camera);
-  const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
-  const there = cameras?.find((camera) => camera.name === name);
-  const fault = problem?.errors.find(({ pointer }) => pointer === "#/camera")?.detail ?? "";
+	const [name, setName] = useState(job.camera);
+	const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
+	const there = cameras?.find((camera) => camera.name === name);
+	const fault = problem?.errors.find(({ pointer }) => pointer === "#/camera")?.detail ?? "";
 
-  useEffect(() => setName(job.camera), [job.id]);
+	useEffect(() => setName(job.camera), [job.id]);
 
-  /** @param {Event} event */
-  async function accept(event) {
-    event.preventDefault();
-    try {
-      const stored = await sendJson(`calibrations/${job.id}/accept`, { camera: name.trim() });
-      setProblem(null);
-      onAccepted(stored);
-    } catch (error) {
-      setProblem(problemOf(error));
-    }
-  }
+	/** @param {Event} event */
+	async function accept(event) {
+		event.preventDefault();
+		try {
+			const stored = await sendJson(`calibrations/${job.id}/accept`, { camera: name.trim() });
+			setProblem(null);
+			onAccepted(stored);
+		} catch (error) {
+			setProblem(problemOf(error));
+		}
+	}
 
-  if (job.camera_revision !== null) {
-    return html`
-      <p><span class="badge good">stored</span> as revision ${job.camera_revision} of camera ${job.camera}.</p>
-      <div class="row">
-        <button type="button" class="primary" onClick=${() => go("depth", { camera: job.camera })}>Measure depth with it</button>
-        <button type="button" onClick=${() => go("cameras", { camera: job.camera })}>See the camera</button>
-        <button type="button" onClick=${onDiscard}>Another calibration</button>
-      </div>
-    `;
-  }
-  return html`
-    <form class="stack" onSubmit=${accept}>
-      <${ProblemBox} problem=${fault ? null : problem} />
-      <div class="field">
-        <label for="accept-name">Store it as camera</label>
-        <input
-          id="accept-name"
-          list="camera-names"
-          autocomplete="off"
-          spellcheck=${false}
-          value=${name}
-          aria-invalid=${fault !== ""}
-          aria-describedby="accept-told"
-          onInput=${(/** @type {any} */ event) => setName(event.target.value)}
-        />
-        <span id="accept-told" class=${fault ? "fault" : "hint"}>
-          ${fault || (there ? `It becomes revision ${there.revision + 1} of ${name}; revision ${there.revision} is kept.` : "A new camera.")}
-        </span>
-      </div>
-      <div class="row">
-        <button class="primary" disabled=${name.trim() === ""}>${there ? "Accept as a new revision" : "Accept as a new camera"}</button>
-        <button type="button" onClick=${onDiscard}>Discard</button>
-      </div>
-    </form>
-  `;
+	if (job.camera_revision !== null) {
+		return html`
+			<p><span class="badge good">stored</span> as revision ${job.camera_revision} of camera ${job.camera}.</p>
+			<div class="row">
+				<button type="button" class="primary" onClick=${() => go("depth", { camera: job.camera })}>Measure depth with it</button>
+				<button type="button" onClick=${() => go("cameras", { camera: job.camera })}>See the camera</button>
+				<button type="button" onClick=${onDiscard}>Another calibration</button>
+			</div>
+		`;
+	}
+	return html`
+		<form class="stack" onSubmit=${accept}>
+			<${ProblemBox} problem=${fault ? null : problem} />
+			<div class="field">
+				<label for="accept-name">Store it as camera</label>
+				<input
+					id="accept-name"
+					list="camera-names"
+					autocomplete="off"
+					spellcheck=${false}
+					value=${name}
+					aria-invalid=${fault !== ""}
+					aria-describedby="accept-told"
+					onInput=${(/** @type {any} */ event) => setName(event.target.value)}
+				/>
+				<span id="accept-told" class=${fault ? "fault" : "hint"}>
+					${fault || (there ? `It becomes revision ${there.revision + 1} of ${name}; revision ${there.revision} is kept.` : "A new camera.")}
+				</span>
+			</div>
+			<div class="row">
+				<button class="primary" disabled=${name.trim() === ""}>${there ? "Accept as a new revision" : "Accept as a new camera"}</button>
+				<button type="button" onClick=${onDiscard}>Discard</button>
+			</div>
+		</form>
+	`;
 }

@@ -6,42 +6,42 @@ import { html, useEffect, useRef } from "./vendor/preact.js";
 
 /** @param {{look: import("./maps.js").Look, counts: Uint32Array | null}} props */
 export function Legend({ look, counts }) {
-  const { map, nearM, farM, hatchesNothing, dotsEither } = look;
-  const bar = useRef(/** @type {HTMLCanvasElement | null} */ (null));
-  useEffect(() => {
-    const context = bar.current?.getContext("2d");
-    if (!context) return;
-    const table = colourTable(map);
-    const pixels = context.createImageData(256, 1);
-    for (let at = 0; at < 256; at++) {
-      pixels.data.set([...table.subarray(3 * (255 - at), 3 * (256 - at)), 255], 4 * at);
-    }
-    context.putImageData(pixels, 0, 0);
-  }, [map]);
-  const decimals = farM - nearM < 0.2 ? 3 : farM - nearM < 2 ? 2 : 1;
-  const written = (/** @type {number} */ depthM) => String(Number(depthM.toFixed(decimals + 1)));
-  return html`<figure class="depth-legend" aria-label=${`Colours: ${nearM.toFixed(2)} m near to ${farM.toFixed(2)} m far`}>
-    ${counts && html`<${Histogram} counts=${counts} />`}
-    <canvas ref=${bar} width="256" height="1" aria-hidden="true"></canvas>
-    <div class="depth-ticks" aria-hidden="true">
-      ${(farM / nearM < 4 ? ticksOf : logTicks)(nearM, farM).map(
-        (depthM) =>
-          html`<span key=${depthM} style=${{ left: `${100 * placeOf(depthM, nearM, farM)}%` }}>${written(depthM)}</span>`,
-      )}
-    </div>
-    <figcaption class="row hint">
-      <span>metres, near to far</span>
-      ${hatchesNothing && html`<span class="choice"><i class="depth-key nothing"></i> no answer</span>`}
-      ${dotsEither && html`<span class="choice"><i class="depth-key either"></i> either side of focus</span>`}
-    </figcaption>
-  </figure>`;
+	const { map, nearM, farM, hatchesNothing, dotsEither } = look;
+	const bar = useRef(/** @type {HTMLCanvasElement | null} */ (null));
+	useEffect(() => {
+		const context = bar.current?.getContext("2d");
+		if (!context) return;
+		const table = colourTable(map);
+		const pixels = context.createImageData(256, 1);
+		for (let at = 0; at < 256; at++) {
+			pixels.data.set([...table.subarray(3 * (255 - at), 3 * (256 - at)), 255], 4 * at);
+		}
+		context.putImageData(pixels, 0, 0);
+	}, [map]);
+	const decimals = farM - nearM < 0.2 ? 3 : farM - nearM < 2 ? 2 : 1;
+	const written = (/** @type {number} */ depthM) => String(Number(depthM.toFixed(decimals + 1)));
+	return html`<figure class="depth-legend" aria-label=${`Colours: ${nearM.toFixed(2)} m near to ${farM.toFixed(2)} m far`}>
+		${counts && html`<${Histogram} counts=${counts} />`}
+		<canvas ref=${bar} width="256" height="1" aria-hidden="true"></canvas>
+		<div class="depth-ticks" aria-hidden="true">
+			${(farM / nearM < 4 ? ticksOf : logTicks)(nearM, farM).map(
+				(depthM) =>
+					html`<span key=${depthM} style=${{ left: `${100 * placeOf(depthM, nearM, farM)}%` }}>${written(depthM)}</span>`,
+			)}
+		</div>
+		<figcaption class="row hint">
+			<span>metres, near to far</span>
+			${hatchesNothing && html`<span class="choice"><i class="depth-key nothing"></i> no answer</span>`}
+			${dotsEither && html`<span class="choice"><i class="depth-key either"></i> either side of focus</span>`}
+		</figcaption>
+	</figure>`;
 }
 
 /** @param {{counts: Uint32Array}} props */
 function Histogram({ counts }) {
-  const most = Math.max(1, ...counts);
-  const steps = Array.from(counts, (count, bin) => `V${(100 - (100 * count) / most).toFixed(1)}H${bin + 1}`).join("");
-  return html`<svg viewBox=${`0 0 ${counts.length} 100`} preserveAspectRatio="none" aria-hidden="true">
-    <path d=${`M0 100${steps}V100Z`} />
-  </svg>`;
+	const most = Math.max(1, ...counts);
+	const steps = Array.from(counts, (count, bin) => `V${(100 - (100 * count) / most).toFixed(1)}H${bin + 1}`).join("");
+	return html`<svg viewBox=${`0 0 ${counts.length} 100`} preserveAspectRatio="none" aria-hidden="true">
+		<path d=${`M0 100${steps}V100Z`} />
+	</svg>`;
 }

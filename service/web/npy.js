@@ -17,56 +17,45 @@ const KINDS = { "<f4": Float32Array, "<f8": Float64Array, "|b1": Uint8Array, "|u
  * @returns {Promise<Map<string, NumpyArray>>} arrays by their names
  */
 export async function readNpz(file) {
-  const end = new DataView(await file.slice(-END_BYTES).arrayBuffer());
-  if (end.byteLength < END_BYTES || end.getUint32(0, true) !== END_OF_DIRECTORY) throw new Error("This is no whole npz.");
-  const [count, directoryBytes, start] = [end.getUint16(10, true), end.getUint32(12, true), end.getUint32(16, true)];
-  const directory = new DataView(await file.slice(start, start + directoryBytes).arrayBuffer());
-  const arrays = new Map();
-  for (let entry = 0, at = 0; entry < count; entry++) {
-    const lengths = [28, 30, 32].map((place) => directory.getUint16(at + place, true));
-    const name = textOf(directory, at + DIRECTORY_ENTRY_BYTES, lengths[0]);
-    const [bytes, header] = [directory.getUint32(at + 24, true), directory.getUint32(at + 42, true)];
-    if (directory.getUint16(at + 10, true) !== 0) throw new Error("A compressed npz cannot be read.");
-    arrays.set(name.replace(/\.npy$/, ""), await readEntry(file, header, bytes));
-    at += DIRECTORY_ENTRY_BYTES + lengths[0] + lengths[1] + lengths[2];
-  }
-  return arrays;
+	const end = new DataView(await file.slice(-END_BYTES).arrayBuffer());
+	if (end.byteLength < END_BYTES || end.getUint32(0, true) !== END_OF_DIRECTORY) throw new Error("This is no whole npz.");
+	const [count, directoryBytes, start] = [end.getUint16(10, true), end.getUint32(12, true), end.getUint32(16, true)];
+	const directory = new DataView(await file.slice(start, start + directoryBytes).arrayBuffer());
+	const arrays = new Map();
+	for (let entry = 0, at = 0; entry < count; entry++) {
+		const lengths = [28, 30, 32].map((place) => directory.getUint16(at + place, true));
+		const name = textOf(directory, at + DIRECTORY_ENTRY_BYTES, lengths[0]);
+		const [bytes, header] = [directory.getUint32(at + 24, true), directory.getUint32(at + 42, true)];
+		if (directory.getUint16(at + 10, true) !== 0) throw new Error("A compressed npz cannot be read.");
+		arrays.set(name.replace(/\.npy$/, ""), await readEntry(file, header, bytes));
+		at += DIRECTORY_ENTRY_BYTES + lengths[0] + lengths[1] + lengths[2];
+	}
+	return arrays;
 }
 
-/**
- * @param {Blob} file
- * @param {number} header where the entry's own header begins
- * @param {number} bytes
- */
+/** @param {Blob} file @param {number} header where the entry's own header begins @param {number} bytes */
 async function readEntry(file, header, bytes) {
-  const local = new DataView(await file.slice(header, header + LOCAL_HEADER_BYTES).arrayBuffer());
-  const start = header + LOCAL_HEADER_BYTES + local.getUint16(26, true) + local.getUint16(28, true);
-  return readNpy(await file.slice(start, start + bytes).arrayBuffer());
+	const local = new DataView(await file.slice(header, header + LOCAL_HEADER_BYTES).arrayBuffer());
+	const start = header + LOCAL_HEADER_BYTES + local.getUint16(26, true) + local.getUint16(28, true);
+	return readNpy(await file.slice(start, start + bytes).arrayBuffer());
 }
 
-/**
- * @param {ArrayBuffer} buffer
- * @returns {NumpyArray}
- */
+/** @param {ArrayBuffer} buffer @returns {NumpyArray} */
 function readNpy(buffer) {
-  const view = new DataView(buffer);
-  if (textOf(view, 1, 5) !== "NUMPY") throw new Error("This is no npy.");
-  const isFirstVersion = view.getUint8(6) === 1;
-  const start = MAGIC_BYTES + (isFirstVersion ? 2 : 4);
-  const length = isFirstVersion ? view.getUint16(8, true) : view.getUint32(8, true);
-  const header = textOf(view, start, length);
-  const kind = /'descr': '([^']+)'/.exec(header)?.[1] ?? "";
-  const sizes = /'shape': \(([^)]*)\)/.exec(header)?.[1] ?? "";
-  if (!(kind in KINDS) || !header.includes("'fortran_order': False")) throw new Error(`npy of ${kind} cannot be read.`);
-  // NumPy pads the header so that the numbers begin at a multiple of 64 bytes
-  return { data: new KINDS[kind](buffer, start + length), shape: (sizes.match(/\d+/g) ?? []).map(Number) };
+	const view = new DataView(buffer);
+	if (textOf(view, 1, 5) !== "NUMPY") throw new Error("This is no npy.");
+	const isFirstVersion = view.getUint8(6) === 1;
+	const start = MAGIC_BYTES + (isFirstVersion ? 2 : 4);
+	const length = isFirstVersion ? view.getUint16(8, true) : view.getUint32(8, true);
+	const header = textOf(view, start, length);
+	const kind = /'descr': '([^']+)'/.exec(header)?.[1] ?? "";
+	const sizes = /'shape': \(([^)]*)\)/.exec(header)?.[1] ?? "";
+	if (!(kind in KINDS) || !header.includes("'fortran_order': False")) throw new Error(`npy of ${kind} cannot be read.`);
+	// NumPy pads the header so that the numbers begin at a multiple of 64 bytes
+	return { data: new KINDS[kind](buffer, start + length), shape: (sizes.match(/\d+/g) ?? []).map(Number) };
 }
 
-/**
- * @param {DataView} view
- * @param {number} start
- * @param {number} length
- */
+/** @param {DataView} view @param {number} start @param {number} length */
 function textOf(view, start, length) {
-  return new TextDecoder("latin1").decode(new Uint8Array(view.buffer, view.byteOffset + start, length));
+	return new TextDecoder("latin1").decode(new Uint8Array(view.buffer, view.byteOffset + start, length));
 }

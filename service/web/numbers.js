@@ -1,39 +1,27 @@
 /** Numbers as people read them. */
 
-/**
- * @param {number | null | undefined} value
- * @param {number} [digits] significant ones
- * @returns {string} a dash for none
- */
+/** @param {number | null | undefined} value @param {number} [digits] significant ones @returns {string} a dash for none */
 export function short(value, digits = 3) {
-  if (value === null || value === undefined || !Number.isFinite(value)) return "–";
-  return String(Number(value.toPrecision(digits)));
+	if (value === null || value === undefined || !Number.isFinite(value)) return "–";
+	return String(Number(value.toPrecision(digits)));
 }
 
-/**
- * @param {number | null} value
- * @param {string} unit with the space before it, where there is one
- * @param {number} [digits]
- */
+/** @param {number | null} value @param {string} unit with the space before it, where there is one @param {number} [digits] */
 export function measure(value, unit, digits = 3) {
-  return value === null ? "–" : short(value, digits) + unit;
+	return value === null ? "–" : short(value, digits) + unit;
 }
 
-/**
- * @param {number} count
- * @param {string} one
- * @param {string} [many]
- */
+/** @param {number} count @param {string} one @param {string} [many] */
 export function counted(count, one, many = `${one}s`) {
-  return `${count} ${count === 1 ? one : many}`;
+	return `${count} ${count === 1 ? one : many}`;
 }
 
 /** @param {string} text as it is typed, with a point or a comma */
 export function decimal(text) {
-  return Number(text.replace(",", "."));
+	return Number(text.replace(",", "."));
 }
 
 /** @param {string} time in ISO 8601 */
 export function when(time) {
-  return new Date(time).toLocaleString(undefined, { dateStyle: "medium", timeStyle: "short" });
+	return new Date(time).toLocaleString(undefined, { dateStyle: "medium", timeStyle: "short" });
 }

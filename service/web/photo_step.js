@@ -20,27 +20,23 @@ const EXPOSURES = { good: "good", over: "too bright", under: "too dark" };
 
 /** @type {{role: Role, title: string, words: string}[]} */
 const ROLES = [
-  {
-    role: "defocused",
-    title: "Focus locked",
-    words: "All with the same focus, nearer and farther than what is sharp; the sharp ones among them too.",
-  },
-  {
-    role: "focused",
-    title: "Focused on the sheet",
-    words: "Only if you took pairs: the sharp partner of each blurred photograph, in the same order.",
-  },
+	{
+		role: "defocused",
+		title: "Focus locked",
+		words: "All with the same focus, nearer and farther than what is sharp; the sharp ones among them too.",
+	},
+	{
+		role: "focused",
+		title: "Focused on the sheet",
+		words: "Only if you took pairs: the sharp partner of each blurred photograph, in the same order.",
+	},
 ];
 
 let lastId = 0;
 
-/**
- * @param {Iterable<File>} files
- * @param {Role} role
- * @returns {Photo[]}
- */
+/** @param {Iterable<File>} files @param {Role} role @returns {Photo[]} */
 function photosOf(files, role) {
-  return [...files].map((file) => ({ id: (lastId += 1), file, role, asked: "", look: null, problem: null }));
+	return [...files].map((file) => ({ id: (lastId += 1), file, role, asked: "", look: null, problem: null }));
 }
 
 /**
@@ -51,41 +47,36 @@ function photosOf(files, role) {
  * @param {string} query the pattern and camera
  */
 export function useLooks(photos, setPhotos, query) {
-  const next = photos.find(({ asked }) => asked !== query);
-  useEffect(() => {
-    if (!next || !query) return undefined;
-    const stop = new AbortController();
-    const tell = (/** @type {Partial<Photo>} */ found) =>
-      setPhotos((before) => before.map((one) => (one.id === next.id ? { ...one, look: null, problem: null, ...found, asked: query } : one)));
-    lookAt(next.file, query, stop.signal).then(
-      (look) => tell({ look }),
-      (error) => {
-        if (stop.signal.aborted) return;
-        tell({ problem: problemOf(error) });
-      },
-    );
-    return () => stop.abort();
-  }, [next?.id, query]);
+	const next = photos.find(({ asked }) => asked !== query);
+	useEffect(() => {
+		if (!next || !query) return undefined;
+		const stop = new AbortController();
+		const tell = (/** @type {Partial<Photo>} */ found) =>
+			setPhotos((before) => before.map((one) => (one.id === next.id ? { ...one, look: null, problem: null, ...found, asked: query } : one)));
+		lookAt(next.file, query, stop.signal).then(
+			(look) => tell({ look }),
+			(error) => {
+				if (stop.signal.aborted) return;
+				tell({ problem: problemOf(error) });
+			},
+		);
+		return () => stop.abort();
+	}, [next?.id, query]);
 }
 
-/**
- * @param {File} file
- * @param {string} query
- * @param {AbortSignal} signal
- * @returns {Promise<any>}
- */
+/** @param {File} file @param {string} query @param {AbortSignal} signal @returns {Promise<any>} */
 async function lookAt(file, query, signal) {
-  for (;;) {
-    try {
-      const headers = { "Content-Type": mediaTypeOf(file) };
-      return await getJson(`calibrate/look?${query}`, { method: "POST", headers, body: file, signal });
-    } catch (error) {
-      if (!(error instanceof Problem && error.retryAfterS)) throw error;
-      const waitMs = error.retryAfterS * 1000;
-      await new Promise((resolve) => setTimeout(resolve, waitMs));
-      signal.throwIfAborted();
-    }
-  }
+	for (;;) {
+		try {
+			const headers = { "Content-Type": mediaTypeOf(file) };
+			return await getJson(`calibrate/look?${query}`, { method: "POST", headers, body: file, signal });
+		} catch (error) {
+			if (!(error instanceof Problem && error.retryAfterS)) throw error;
+			const waitMs = error.retryAfterS * 1000;
+			await new Promise((resolve) => setTimeout(resolve, waitMs));
+			signal.throwIfAborted();
+		}
+	}
 }
 
 /**
@@ -93,249 +84,235 @@ async function lookAt(file, query, signal) {
  *   onChange: (change: (before: Photo[]) => Photo[]) => void, announce: (text: string) => void}} props
  */
 export function Photographs({ photos, query, focus, onAdd, onChange, announce }) {
-  const waiting = photos.filter(({ asked }) => asked !== query).length;
-  const seen = photos.filter(({ look }) => look?.found).map(seenOf);
-  const next = adviceFor(seen, focus);
-  useEffect(() => {
-    if (photos.length > 0 && waiting === 0) announce(`The sheet is found in ${seen.length} of ${counted(photos.length, "photograph")}. ${next}`);
-  }, [waiting === 0, photos.length]);
+	const waiting = photos.filter(({ asked }) => asked !== query).length;
+	const seen = photos.filter(({ look }) => look?.found).map(seenOf);
+	const next = adviceFor(seen, focus);
+	useEffect(() => {
+		if (photos.length > 0 && waiting === 0) announce(`The sheet is found in ${seen.length} of ${counted(photos.length, "photograph")}. ${next}`);
+	}, [waiting === 0, photos.length]);
 
-  return html`
-    <div class="columns">
-      ${ROLES.map((one) => html`<${DropZone} key=${one.role} ...${one} onFiles=${(/** @type {File[]} */ files) => onAdd(photosOf(files, one.role))} />`)}
-    </div>
-    <div class="notice next">
-      <p>
-        <strong>${next}</strong>
-        ${photos.length > 0 && html` <span>${`The sheet is found in ${seen.length} of ${counted(photos.length, "photograph")}; ${WANTED} to 12 make a good set.`}</span>`}
-      </p>
-      ${waiting > 0 && html`<p class="hint">Looking at ${counted(waiting, "photograph")} ...</p>`}
-    </div>
-    ${photos.length > 0 &&
-    html`<ul class="photos" aria-label="Photographs">
-      ${photos.map(
-        (photo) => html`<${PhotoCard}
-          key=${photo.id}
-          photo=${photo}
-          isLooking=${photo.asked !== query}
-          hasPartner=${hasPartner(photo, photos)}
-          onRole=${(/** @type {Role} */ role) => onChange((before) => before.map((one) => (one.id === photo.id ? { ...one, role } : one)))}
-          onAgain=${() => onChange((before) => before.map((one) => (one.id === photo.id ? { ...one, asked: "" } : one)))}
-          onRemove=${() => onChange((before) => before.filter(({ id }) => id !== photo.id))}
-        />`,
-      )}
-    </ul>`}
-    ${seen.length > 0 &&
-    html`<div class="columns">
-      <${Coverage} seen=${seen} />
-      <${Distances} seen=${seen} focus=${focusOf(seen, focus)} />
-    </div>`}
-  `;
+	return html`
+		<div class="columns">
+			${ROLES.map((one) => html`<${DropZone} key=${one.role} ...${one} onFiles=${(/** @type {File[]} */ files) => onAdd(photosOf(files, one.role))} />`)}
+		</div>
+		<div class="notice next">
+			<p>
+				<strong>${next}</strong>
+				${photos.length > 0 && html` <span>${`The sheet is found in ${seen.length} of ${counted(photos.length, "photograph")}; ${WANTED} to 12 make a good set.`}</span>`}
+			</p>
+			${waiting > 0 && html`<p class="hint">Looking at ${counted(waiting, "photograph")} ...</p>`}
+		</div>
+		${photos.length > 0 &&
+		html`<ul class="photos" aria-label="Photographs">
+			${photos.map(
+				(photo) => html`<${PhotoCard}
+					key=${photo.id}
+					photo=${photo}
+					isLooking=${photo.asked !== query}
+					hasPartner=${hasPartner(photo, photos)}
+					onRole=${(/** @type {Role} */ role) => onChange((before) => before.map((one) => (one.id === photo.id ? { ...one, role } : one)))}
+					onAgain=${() => onChange((before) => before.map((one) => (one.id === photo.id ? { ...one, asked: "" } : one)))}
+					onRemove=${() => onChange((before) => before.filter(({ id }) => id !== photo.id))}
+				/>`,
+			)}
+		</ul>`}
+		${seen.length > 0 &&
+		html`<div class="columns">
+			<${Coverage} seen=${seen} />
+			<${Distances} seen=${seen} focus=${focusOf(seen, focus)} />
+		</div>`}
+	`;
 }
 
 /** @param {Photo} photo that is found @returns {import("./guidance.js").Seen} */
 function seenOf({ role, look }) {
-  const { width_px: width, height_px: height, orientation, circles, blur_px: blur, distance_m: distance, tilt_deg: tilt } = look;
-  return { role, width, height, orientation, circles, blur, distance, tilt };
+	const { width_px: width, height_px: height, orientation, circles, blur_px: blur, distance_m: distance, tilt_deg: tilt } = look;
+	return { role, width, height, orientation, circles, blur, distance, tilt };
 }
 
-/**
- * Whether a defocused photograph has a focused one to tell where its circles are.
- *
- * @param {Photo} photo
- * @param {Photo[]} photos
- */
+/** Whether a defocused photograph has a focused one to tell where its circles are. @param {Photo} photo @param {Photo[]} photos */
 function hasPartner(photo, photos) {
-  const place = photos.filter(({ role }) => role === "defocused").indexOf(photo);
-  return place >= 0 && Boolean(photos.filter(({ role }) => role === "focused")[place]?.look?.found);
+	const place = photos.filter(({ role }) => role === "defocused").indexOf(photo);
+	return place >= 0 && Boolean(photos.filter(({ role }) => role === "focused")[place]?.look?.found);
 }
 
-/**
- * @param {{role: Role, title: string, words: string, onFiles: (files: File[]) => void}} props
- */
+/** @param {{role: Role, title: string, words: string, onFiles: (files: File[]) => void}} props */
 function DropZone({ role, title, words, onFiles }) {
-  const input = useRef(/** @type {HTMLInputElement | null} */ (null));
-  const [isOver, setIsOver] = useState(false);
-  return html`
-    <div
-      class=${`drop ${isOver ? "over" : ""}`}
-      onDragOver=${(/** @type {DragEvent} */ event) => {
-        event.preventDefault();
-        setIsOver(true);
-      }}
-      onDragLeave=${() => setIsOver(false)}
-      onDrop=${(/** @type {DragEvent} */ event) => {
-        event.preventDefault();
-        setIsOver(false);
-        onFiles([...(event.dataTransfer?.files ?? [])]);
-      }}
-    >
-      <h3>${title}</h3>
-      <p class="hint">${words}</p>
-      <button type="button" onClick=${() => input.current?.click()}>Choose photographs</button>
-      <span class="hint">or drop them here</span>
-      <input
-        ref=${input}
-        type="file"
-        multiple
-        hidden
-        accept=${PHOTOGRAPHS}
-        data-role=${role}
-        aria-label=${title}
-        onChange=${() => {
-          onFiles([...(input.current?.files ?? [])]);
-          if (input.current) input.current.value = "";
-        }}
-      />
-    </div>
-  `;
+	const input = useRef(/** @type {HTMLInputElement | null} */ (null));
+	const [isOver, setIsOver] = useState(false);
+	return html`
+		<div
+			class=${`drop ${isOver ? "over" : ""}`}
+			onDragOver=${(/** @type {DragEvent} */ event) => {
+				event.preventDefault();
+				setIsOver(true);
+			}}
+			onDragLeave=${() => setIsOver(false)}
+			onDrop=${(/** @type {DragEvent} */ event) => {
+				event.preventDefault();
+				setIsOver(false);
+				onFiles([...(event.dataTransfer?.files ?? [])]);
+			}}
+		>
+			<h3>${title}</h3>
+			<p class="hint">${words}</p>
+			<button type="button" onClick=${() => input.current?.click()}>Choose photographs</button>
+			<span class="hint">or drop them here</span>
+			<input
+				ref=${input}
+				type="file"
+				multiple
+				hidden
+				accept=${PHOTOGRAPHS}
+				data-role=${role}
+				aria-label=${title}
+				onChange=${() => {
+					onFiles([...(input.current?.files ?? [])]);
+					if (input.current) input.current.value = "";
+				}}
+			/>
+		</div>
+	`;
 }
 
-/**
- * @param {{photo: Photo, isLooking: boolean, hasPartner: boolean, onRole: (role: Role) => void,
- *   onAgain: () => void, onRemove: () => void}} props
- */
+/** @param {{photo: Photo, isLooking: boolean, hasPartner: boolean, onRole: (role: Role) => void, onAgain: () => void, onRemove: () => void}} props */
 function PhotoCard({ photo, isLooking, hasPartner: partner, onRole, onAgain, onRemove }) {
-  const { file, look, problem, role } = photo;
-  const [tone, words] = statusOf(photo, isLooking);
-  return html`
-    <li class="card tight">
-      <${Thumb} file=${file} look=${look} />
-      <div class="row ends">
-        <span class="file" title=${file.name}>${file.name}</span>
-        <span class=${`badge ${tone}`}>${words}</span>
-      </div>
-      ${problem &&
-      html`<p class="fault">${problem.title} ${problem.detail}</p>
-        ${!isLooking && html`<button type="button" onClick=${onAgain}>Look again</button>`}`}
-      ${look?.found &&
-      html`<dl class="facts">
-        <dt>Blur</dt><dd>${measure(look.blur_px, " px")}</dd>
-        <dt>Distance</dt><dd>${measure(look.distance_m, " m")}</dd>
-        <dt>Tilt</dt><dd>${measure(look.tilt_deg, "°", 2)}</dd>
-        <dt>Exposure</dt>
-        <dd class=${look.exposure === "good" ? "" : "fault"}>${EXPOSURES[/** @type {keyof typeof EXPOSURES} */ (look.exposure)]}</dd>
-      </dl>`}
-      ${look?.warnings.map((/** @type {string} */ told) => html`<p class="hint">${told}</p>`)}
-      ${look && !look.found && partner && html`<p class="hint">Its circles are looked for where its sharp partner has them.</p>`}
-      <div class="row ends">
-        <select
-          aria-label=${`How ${file.name} was focused`}
-          value=${role}
-          onChange=${(/** @type {any} */ event) => onRole(/** @type {Role} */ (event.target.value))}
-        >
-          ${ROLES.map((one) => html`<option value=${one.role}>${one.title}</option>`)}
-        </select>
-        <button type="button" class="quiet" aria-label=${`Remove ${file.name}`} onClick=${onRemove}>Remove</button>
-      </div>
-    </li>
-  `;
+	const { file, look, problem, role } = photo;
+	const [tone, words] = statusOf(photo, isLooking);
+	return html`
+		<li class="card tight">
+			<${Thumb} file=${file} look=${look} />
+			<div class="row ends">
+				<span class="file" title=${file.name}>${file.name}</span>
+				<span class=${`badge ${tone}`}>${words}</span>
+			</div>
+			${problem &&
+			html`<p class="fault">${problem.title} ${problem.detail}</p>
+				${!isLooking && html`<button type="button" onClick=${onAgain}>Look again</button>`}`}
+			${look?.found &&
+			html`<dl class="facts">
+				<dt>Blur</dt><dd>${measure(look.blur_px, " px")}</dd>
+				<dt>Distance</dt><dd>${measure(look.distance_m, " m")}</dd>
+				<dt>Tilt</dt><dd>${measure(look.tilt_deg, "°", 2)}</dd>
+				<dt>Exposure</dt>
+				<dd class=${look.exposure === "good" ? "" : "fault"}>${EXPOSURES[/** @type {keyof typeof EXPOSURES} */ (look.exposure)]}</dd>
+			</dl>`}
+			${look?.warnings.map((/** @type {string} */ told) => html`<p class="hint">${told}</p>`)}
+			${look && !look.found && partner && html`<p class="hint">Its circles are looked for where its sharp partner has them.</p>`}
+			<div class="row ends">
+				<select
+					aria-label=${`How ${file.name} was focused`}
+					value=${role}
+					onChange=${(/** @type {any} */ event) => onRole(/** @type {Role} */ (event.target.value))}
+				>
+					${ROLES.map((one) => html`<option value=${one.role}>${one.title}</option>`)}
+				</select>
+				<button type="button" class="quiet" aria-label=${`Remove ${file.name}`} onClick=${onRemove}>Remove</button>
+			</div>
+		</li>
+	`;
 }
 
 /** @param {Photo} photo @param {boolean} isLooking @returns {[string, string]} */
 function statusOf({ look, problem }, isLooking) {
-  if (isLooking) return ["", "looking ..."];
-  if (problem) return ["bad", [413, 415, 422].includes(problem.status) ? "not readable" : "not looked at"];
-  if (!look?.found) return ["bad", "no grid"];
-  if (look.measured === 0) return ["bad", "not measured"];
-  return look.warnings.length > 0 || look.exposure !== "good" ? ["warn", "found"] : ["good", "found"];
+	if (isLooking) return ["", "looking ..."];
+	if (problem) return ["bad", [413, 415, 422].includes(problem.status) ? "not readable" : "not looked at"];
+	if (!look?.found) return ["bad", "no grid"];
+	if (look.measured === 0) return ["bad", "not measured"];
+	return look.warnings.length > 0 || look.exposure !== "good" ? ["warn", "found"] : ["good", "found"];
 }
 
-/**
- * The photograph upright and small, with the circles over it.
- *
- * @param {{file: File, look: any | null}} props
- */
+/** The photograph upright and small, with the circles over it. @param {{file: File, look: any | null}} props */
 function Thumb({ file, look }) {
-  const canvas = useRef(/** @type {HTMLCanvasElement | null} */ (null));
-  const [bitmap, setBitmap] = useState(/** @type {ImageBitmap | null} */ (null));
-  useEffect(() => {
-    let made = /** @type {ImageBitmap | null} */ (null);
-    let isGone = false;
-    readShown(file, THUMB_PX, (shown) =>
-      createImageBitmap(shown, { resizeWidth: THUMB_PX, resizeQuality: "medium" }).catch(() => null),
-    ).then((found) => {
-      made = found;
-      if (isGone) found?.close();
-      else setBitmap(found);
-    });
-    return () => {
-      isGone = true;
-      made?.close();
-    };
-  }, [file]);
-  useEffect(() => {
-    if (canvas.current) draw(canvas.current, bitmap, look);
-  }, [bitmap, look]);
-  const words = look?.found ? `${file.name} with ${look.circles.length} circles found` : file.name;
-  return html`<canvas ref=${canvas} role="img" aria-label=${words}></canvas>`;
+	const canvas = useRef(/** @type {HTMLCanvasElement | null} */ (null));
+	const [bitmap, setBitmap] = useState(/** @type {ImageBitmap | null} */ (null));
+	useEffect(() => {
+		let made = /** @type {ImageBitmap | null} */ (null);
+		let isGone = false;
+		readShown(file, THUMB_PX, (shown) =>
+			createImageBitmap(shown, { resizeWidth: THUMB_PX, resizeQuality: "medium" }).catch(() => null),
+		).then((found) => {
+			made = found;
+			if (isGone) found?.close();
+			else setBitmap(found);
+		});
+		return () => {
+			isGone = true;
+			made?.close();
+		};
+	}, [file]);
+	useEffect(() => {
+		if (canvas.current) draw(canvas.current, bitmap, look);
+	}, [bitmap, look]);
+	const words = look?.found ? `${file.name} with ${look.circles.length} circles found` : file.name;
+	return html`<canvas ref=${canvas} role="img" aria-label=${words}></canvas>`;
 }
 
 /** @param {HTMLCanvasElement} canvas @param {ImageBitmap | null} bitmap @param {any | null} look */
 function draw(canvas, bitmap, look) {
-  const isTurned = look !== null && look.orientation > 4;
-  const [width, height] = look ? (isTurned ? [look.height_px, look.width_px] : [look.width_px, look.height_px]) : [4, 3];
-  canvas.width = THUMB_PX;
-  canvas.height = bitmap ? bitmap.height : Math.round((THUMB_PX * height) / width);
-  const pen = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
-  if (bitmap) pen.drawImage(bitmap, 0, 0, canvas.width, canvas.height);
-  if (!look?.found) return;
-  const scale = THUMB_PX / width;
-  pen.lineWidth = 2;
-  pen.strokeStyle = "#ffd166";
-  for (const { u_px: u, v_px: v, radius_px: radius } of look.circles) {
-    const [x, y] = upright(u + 0.5, v + 0.5, look.orientation, look.width_px, look.height_px);
-    pen.beginPath();
-    pen.arc(x * scale, y * scale, Math.max(radius * scale, 2), 0, 2 * Math.PI);
-    pen.stroke();
-  }
+	const isTurned = look !== null && look.orientation > 4;
+	const [width, height] = look ? (isTurned ? [look.height_px, look.width_px] : [look.width_px, look.height_px]) : [4, 3];
+	canvas.width = THUMB_PX;
+	canvas.height = bitmap ? bitmap.height : Math.round((THUMB_PX * height) / width);
+	const pen = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
+	if (bitmap) pen.drawImage(bitmap, 0, 0, canvas.width, canvas.height);
+	if (!look?.found) return;
+	const scale = THUMB_PX / width;
+	pen.lineWidth = 2;
+	pen.strokeStyle = "#ffd166";
+	for (const { u_px: u, v_px: v, radius_px: radius } of look.circles) {
+		const [x, y] = upright(u + 0.5, v + 0.5, look.orientation, look.width_px, look.height_px);
+		pen.beginPath();
+		pen.arc(x * scale, y * scale, Math.max(radius * scale, 2), 0, 2 * Math.PI);
+		pen.stroke();
+	}
 }
 
 /** @param {{seen: import("./guidance.js").Seen[]}} props */
 function Coverage({ seen }) {
-  const cells = coverageOf(seen);
-  const most = Math.max(...cells.flat());
-  const covered = cells.flat().filter((count) => count > 0).length;
-  const words = `Circles were in ${covered} of ${cells.flat().length} parts of the frame`;
-  return html`
-    <figure class="card">
-      <figcaption><h3>Coverage of the frame</h3></figcaption>
-      <svg class="coverage" viewBox=${`0 0 ${cells[0].length * 10} ${cells.length * 10}`} role="img" aria-label=${words}>
-        ${cells.map((row, y) =>
-          row.map(
-            (count, x) => html`<rect
-              x=${x * 10 + 0.25}
-              y=${y * 10 + 0.25}
-              width="9.5"
-              height="9.5"
-              class=${count === 0 ? "empty" : ""}
-              fill-opacity=${count === 0 ? 1 : 0.25 + (0.75 * count) / most}
-            />`,
-          ),
-        )}
-      </svg>
-      <p class="hint">${words}. A lens is not alike everywhere: let the sheet reach the corners too.</p>
-    </figure>
-  `;
+	const cells = coverageOf(seen);
+	const most = Math.max(...cells.flat());
+	const covered = cells.flat().filter((count) => count > 0).length;
+	const words = `Circles were in ${covered} of ${cells.flat().length} parts of the frame`;
+	return html`
+		<figure class="card">
+			<figcaption><h3>Coverage of the frame</h3></figcaption>
+			<svg class="coverage" viewBox=${`0 0 ${cells[0].length * 10} ${cells.length * 10}`} role="img" aria-label=${words}>
+				${cells.map((row, y) =>
+					row.map(
+						(count, x) => html`<rect
+							x=${x * 10 + 0.25}
+							y=${y * 10 + 0.25}
+							width="9.5"
+							height="9.5"
+							class=${count === 0 ? "empty" : ""}
+							fill-opacity=${count === 0 ? 1 : 0.25 + (0.75 * count) / most}
+						/>`,
+					),
+				)}
+			</svg>
+			<p class="hint">${words}. A lens is not alike everywhere: let the sheet reach the corners too.</p>
+		</figure>
+	`;
 }
 
 /** @param {{seen: import("./guidance.js").Seen[], focus: number | null}} props */
 function Distances({ seen, focus }) {
-  const points = seen.flatMap(({ distance: x, blur: y }) => (x === null || y === null ? [] : [{ x, y }]));
-  return html`
-    <div class="card">
-      <h3>Coverage over distance</h3>
-      ${points.length > 0
-        ? html`<${Chart}
-            title="Blur of each photograph"
-            x=${{ label: "distance", unit: "m", isLog: true, from: Math.min(...points.map(({ x }) => x), focus ?? Infinity) * 0.8, to: Math.max(...points.map(({ x }) => x), focus ?? 0) * 1.25 }}
-            y=${{ label: "blur", unit: "px", from: 0 }}
-            marks=${focus ? [{ x: focus, label: "sharpest" }] : []}
-            series=${[{ name: "", kind: "dots", tone: "one", points }]}
-          />`
-        : html`<p class="hint">
-            Neither a camera nor the photographs' EXIF tells the focal length, so distances are known only after the calibration.
-          </p>`}
-    </div>
-  `;
+	const points = seen.flatMap(({ distance: x, blur: y }) => (x === null || y === null ? [] : [{ x, y }]));
+	return html`
+		<div class="card">
+			<h3>Coverage over distance</h3>
+			${points.length > 0
+				? html`<${Chart}
+						title="Blur of each photograph"
+						x=${{ label: "distance", unit: "m", isLog: true, from: Math.min(...points.map(({ x }) => x), focus ?? Infinity) * 0.8, to: Math.max(...points.map(({ x }) => x), focus ?? 0) * 1.25 }}
+						y=${{ label: "blur", unit: "px", from: 0 }}
+						marks=${focus ? [{ x: focus, label: "sharpest" }] : []}
+						series=${[{ name: "", kind: "dots", tone: "one", points }]}
+					/>`
+				: html`<p class="hint">
+						Neither a camera nor the photographs' EXIF tells the focal length, so distances are known only after the calibration.
+					</p>`}
+		</div>
+	`;
 }

@@ -6,8 +6,8 @@ export const PHOTOGRAPHS = "image/*,.heic,.heif,.dng,.cr2,.nef,.arw";
 
 /** @param {File} file */
 export function mediaTypeOf(file) {
-  // the service looks at the bytes where no kind is told
-  return file.type.startsWith("image/") ? file.type : "application/octet-stream";
+	// the service looks at the bytes where no kind is told
+	return file.type.startsWith("image/") ? file.type : "application/octet-stream";
 }
 
 /**
@@ -19,9 +19,9 @@ export function mediaTypeOf(file) {
  * @param {(shown: Blob) => Promise<T | null>} read
  */
 export async function readShown(file, longestPx, read) {
-  const found = await read(file);
-  if (found !== null) return found;
-  const about = { method: "POST", headers: { "Content-Type": mediaTypeOf(file) }, body: file, asks: false };
-  const preview = await getBlob(`photographs/preview?longest_px=${longestPx}`, about).catch(() => null);
-  return preview && read(preview);
+	const found = await read(file);
+	if (found !== null) return found;
+	const about = { method: "POST", headers: { "Content-Type": mediaTypeOf(file) }, body: file, asks: false };
+	const preview = await getBlob(`photographs/preview?longest_px=${longestPx}`, about).catch(() => null);
+	return preview && read(preview);
 }

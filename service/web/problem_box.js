@@ -7,36 +7,36 @@ import { html, useEffect, useState } from "./vendor/preact.js";
  *   renders nothing where there is no problem
  */
 export function ProblemBox({ problem, onRetry, onClose }) {
-  const waitS = useCountdown(problem);
-  if (problem === null) return null;
-  const { title, detail, errors, requestId } = problem;
-  const isMoreThanDetail = errors.length > 1 || (errors.length === 1 && !detail.includes(errors[0].detail));
-  return html`
-    <div class="problem" role="alert">
-      <p><strong>${title}</strong> ${detail}</p>
-      ${isMoreThanDetail &&
-      html`<ul>${errors.map((fault) => html`<li><code>${fault.pointer}</code> ${fault.detail}</li>`)}</ul>`}
-      ${requestId && html`<p class="hint" aria-live="off">Request ${requestId}</p>`}
-      ${(onRetry || onClose) &&
-      html`<div class="row">
-        ${onRetry &&
-        html`<button type="button" onClick=${onRetry}>
-          Try again${waitS > 0 && html`<span aria-hidden="true"> (in ${waitS} s)</span>`}
-        </button>`}
-        ${onClose && html`<button type="button" class="quiet" onClick=${onClose}>Dismiss</button>`}
-      </div>`}
-    </div>
-  `;
+	const waitS = useCountdown(problem);
+	if (problem === null) return null;
+	const { title, detail, errors, requestId } = problem;
+	const isMoreThanDetail = errors.length > 1 || (errors.length === 1 && !detail.includes(errors[0].detail));
+	return html`
+		<div class="problem" role="alert">
+			<p><strong>${title}</strong> ${detail}</p>
+			${isMoreThanDetail &&
+			html`<ul>${errors.map((fault) => html`<li><code>${fault.pointer}</code> ${fault.detail}</li>`)}</ul>`}
+			${requestId && html`<p class="hint" aria-live="off">Request ${requestId}</p>`}
+			${(onRetry || onClose) &&
+			html`<div class="row">
+				${onRetry &&
+				html`<button type="button" onClick=${onRetry}>
+					Try again${waitS > 0 && html`<span aria-hidden="true"> (in ${waitS} s)</span>`}
+				</button>`}
+				${onClose && html`<button type="button" class="quiet" onClick=${onClose}>Dismiss</button>`}
+			</div>`}
+		</div>
+	`;
 }
 
 /** @param {import("./api.js").Problem | null} problem whose wait is counted down, in seconds */
 function useCountdown(problem) {
-  const [waitS, setWaitS] = useState(0);
-  useEffect(() => {
-    setWaitS(problem?.retryAfterS ?? 0);
-    if (!problem?.retryAfterS) return undefined;
-    const timer = setInterval(() => setWaitS((seconds) => Math.max(0, seconds - 1)), 1000);
-    return () => clearInterval(timer);
-  }, [problem]);
-  return waitS;
+	const [waitS, setWaitS] = useState(0);
+	useEffect(() => {
+		setWaitS(problem?.retryAfterS ?? 0);
+		if (!problem?.retryAfterS) return undefined;
+		const timer = setInterval(() => setWaitS((seconds) => Math.max(0, seconds - 1)), 1000);
+		return () => clearInterval(timer);
+	}, [problem]);
+	return waitS;
 }

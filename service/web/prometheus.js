@@ -2,16 +2,13 @@
 
 /** @typedef {{name: string, labels: Record<string, string>, value: number}} Sample */
 
-/**
- * @param {string} text
- * @returns {Sample[]}
- */
+/** @param {string} text @returns {Sample[]} */
 export function readSamples(text) {
-  return [...text.matchAll(/^(\w+)(?:\{(.*)\})? (\S+)$/gm)].map(([, name, labels = "", value]) => ({
-    name,
-    labels: Object.fromEntries([...labels.matchAll(/(\w+)="((?:[^"\\]|\\.)*)"/g)].map(([, key, text]) => [key, text])),
-    value: Number(value.replace("Inf", "Infinity")),
-  }));
+	return [...text.matchAll(/^(\w+)(?:\{(.*)\})? (\S+)$/gm)].map(([, name, labels = "", value]) => ({
+		name,
+		labels: Object.fromEntries([...labels.matchAll(/(\w+)="((?:[^"\\]|\\.)*)"/g)].map(([, key, text]) => [key, text])),
+		value: Number(value.replace("Inf", "Infinity")),
+	}));
 }
 
 /**
@@ -21,9 +18,9 @@ export function readSamples(text) {
  * @returns {number} 0 where nothing was counted yet
  */
 export function valueOf(samples, name, labels = {}) {
-  const wanted = Object.entries(labels);
-  const fitting = samples.filter((one) => one.name === name && wanted.every(([key, text]) => one.labels[key] === text));
-  return fitting.reduce((sum, { value }) => sum + value, 0);
+	const wanted = Object.entries(labels);
+	const fitting = samples.filter((one) => one.name === name && wanted.every(([key, text]) => one.labels[key] === text));
+	return fitting.reduce((sum, { value }) => sum + value, 0);
 }
 
 /**
@@ -34,13 +31,13 @@ export function valueOf(samples, name, labels = {}) {
  *   `within` is the smallest bound counted against below which that part lies
  */
 export function histogramOf(samples, name, labels = {}) {
-  const count = valueOf(samples, `${name}_count`, labels);
-  if (count === 0) return null;
-  const bounds = [...new Set(samples.filter((one) => one.name === `${name}_bucket`).map(({ labels: { le } }) => le))];
-  return {
-    count,
-    meanS: valueOf(samples, `${name}_sum`, labels) / count,
-    within: (part) =>
-      Number(bounds.find((le) => valueOf(samples, `${name}_bucket`, { ...labels, le }) >= part * count) ?? Infinity),
-  };
+	const count = valueOf(samples, `${name}_count`, labels);
+	if (count === 0) return null;
+	const bounds = [...new Set(samples.filter((one) => one.name === `${name}_bucket`).map(({ labels: { le } }) => le))];
+	return {
+		count,
+		meanS: valueOf(samples, `${name}_sum`, labels) / count,
+		within: (part) =>
+			Number(bounds.find((le) => valueOf(samples, `${name}_bucket`, { ...labels, le }) >= part * count) ?? Infinity),
+	};
 }

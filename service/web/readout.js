@@ -2,47 +2,44 @@
 
 import { html } from "./vendor/preact.js";
 
-/**
- * @param {number} value
- * @param {number} [digits] of its decimals; a millimetre by default
- */
+/** @param {number} value @param {number} [digits] of its decimals; a millimetre by default */
 export function metres(value, digits = 3) {
-  return `${value.toFixed(digits)} m`;
+	return `${value.toFixed(digits)} m`;
 }
 
 /** @typedef {import("./maps.js").Reading} Reading */
 
 /** @param {{reading: Reading | null}} props */
 export function Readout({ reading }) {
-  const [side, likelihood] = reading ? sideOf(reading) : ["", 0];
-  return html`<section class="card stack depth-readout" aria-label="Under the pointer">
-    <h3>Under the pointer</h3>
-    ${reading === null
-      ? html`<p class="depth-metres depth-none">–</p>
-          <p class="hint">Point at the picture, or go into it with Tab and the arrow keys.</p>`
-      : html`<p class="depth-metres">
-            ${reading.depthM === null
-              ? "No answer here"
-              : html`<strong data-value="depth">${metres(reading.depthM)}</strong>${" "}
-                  <span data-value="sigma">± ${metres(reading.sigmaM ?? 0)}</span>`}
-          </p>
-          <dl class="facts">
-            <dt>Side</dt>
-            <dd>${reading.depthM === null ? "–" : `${side}, ${percent(likelihood)}`}</dd>
-            <dt>Or else</dt>
-            <dd data-value="other">
-              ${reading.depthM === null
-                ? "–"
-                : reading.otherM === null
-                  ? "no other distance fits"
-                  : `${metres(reading.otherM)}, ${percent(1 - likelihood)}`}
-            </dd>
-            <dt>Blur</dt>
-            <dd data-value="blur">${reading.blurPx.toFixed(2)} px</dd>
-            <dt>Pixel</dt>
-            <dd data-value="pixel">${reading.u}, ${reading.v}</dd>
-          </dl>`}
-  </section>`;
+	const [side, likelihood] = reading ? sideOf(reading) : ["", 0];
+	return html`<section class="card stack depth-readout" aria-label="Under the pointer">
+		<h3>Under the pointer</h3>
+		${reading === null
+			? html`<p class="depth-metres depth-none">–</p>
+					<p class="hint">Point at the picture, or go into it with Tab and the arrow keys.</p>`
+			: html`<p class="depth-metres">
+						${reading.depthM === null
+							? "No answer here"
+							: html`<strong data-value="depth">${metres(reading.depthM)}</strong>${" "}
+									<span data-value="sigma">± ${metres(reading.sigmaM ?? 0)}</span>`}
+					</p>
+					<dl class="facts">
+						<dt>Side</dt>
+						<dd>${reading.depthM === null ? "–" : `${side}, ${percent(likelihood)}`}</dd>
+						<dt>Or else</dt>
+						<dd data-value="other">
+							${reading.depthM === null
+								? "–"
+								: reading.otherM === null
+									? "no other distance fits"
+									: `${metres(reading.otherM)}, ${percent(1 - likelihood)}`}
+						</dd>
+						<dt>Blur</dt>
+						<dd data-value="blur">${reading.blurPx.toFixed(2)} px</dd>
+						<dt>Pixel</dt>
+						<dd data-value="pixel">${reading.u}, ${reading.v}</dd>
+					</dl>`}
+	</section>`;
 }
 
 /**
@@ -54,55 +51,52 @@ export function Readout({ reading }) {
  * }} props
  */
 export function Distance({ marks, measured, hasPoints, onClear }) {
-  const says = () => {
-    if (!hasPoints) return "Needs the camera's focal length: give the camera its lens or its intrinsics.";
-    if (marks.length === 0) return "Click two points of the picture.";
-    if (marks.length === 1) return "Click the second point.";
-    return measured === "unknown" ? "One of the points has no answer." : "";
-  };
-  return html`<section class="card stack" aria-label="Distance in space">
-    <h3>Distance in space</h3>
-    ${measured !== null && measured !== "unknown"
-      ? html`<p class="depth-metres">
-          <strong data-value="distance">${metres(measured.distanceM)}</strong>${" "}
-          <span data-value="distance-sigma">± ${metres(measured.sigmaM)}</span>
-        </p>`
-      : html`<p class="hint">${says()}</p>`}
-    ${marks.length > 0 &&
-    html`<div class="row"><button type="button" onClick=${onClear}>Clear points</button></div>`}
-  </section>`;
+	const says = () => {
+		if (!hasPoints) return "Needs the camera's focal length: give the camera its lens or its intrinsics.";
+		if (marks.length === 0) return "Click two points of the picture.";
+		if (marks.length === 1) return "Click the second point.";
+		return measured === "unknown" ? "One of the points has no answer." : "";
+	};
+	return html`<section class="card stack" aria-label="Distance in space">
+		<h3>Distance in space</h3>
+		${measured !== null && measured !== "unknown"
+			? html`<p class="depth-metres">
+					<strong data-value="distance">${metres(measured.distanceM)}</strong>${" "}
+					<span data-value="distance-sigma">± ${metres(measured.sigmaM)}</span>
+				</p>`
+			: html`<p class="hint">${says()}</p>`}
+		${marks.length > 0 &&
+		html`<div class="row"><button type="button" onClick=${onClear}>Clear points</button></div>`}
+	</section>`;
 }
 
 /** @param {{timings: [string, number][], model: string}} props */
 export function Timings({ timings, model }) {
-  const totalMs = timings.reduce((sum, [, ms]) => sum + ms, 0);
-  return html`<details class="card">
-    <summary>The service took ${(totalMs / 1000).toFixed(2)} s</summary>
-    <table class="depth-timings">
-      <tbody>
-        ${timings.map(
-          ([stage, ms]) => html`<tr key=${stage}>
-            <th scope="row">${stage}</th>
-            <td class="number">${ms.toFixed(0)} ms</td>
-            <td><span style=${{ width: `${(100 * ms) / (totalMs || 1)}%` }}></span></td>
-          </tr>`,
-        )}
-      </tbody>
-    </table>
-    <p class="hint">${model}</p>
-  </details>`;
+	const totalMs = timings.reduce((sum, [, ms]) => sum + ms, 0);
+	return html`<details class="card">
+		<summary>The service took ${(totalMs / 1000).toFixed(2)} s</summary>
+		<table class="depth-timings">
+			<tbody>
+				${timings.map(
+					([stage, ms]) => html`<tr key=${stage}>
+						<th scope="row">${stage}</th>
+						<td class="number">${ms.toFixed(0)} ms</td>
+						<td><span style=${{ width: `${(100 * ms) / (totalMs || 1)}%` }}></span></td>
+					</tr>`,
+				)}
+			</tbody>
+		</table>
+		<p class="hint">${model}</p>
+	</details>`;
 }
 
-/**
- * @param {Reading} reading
- * @returns {[string, number]} the side that the answer is on, and how likely that is
- */
+/** @param {Reading} reading @returns {[string, number]} the side that the answer is on, and how likely that is */
 function sideOf({ depthM, otherM, pNear }) {
-  const isNear = depthM !== null && otherM !== null ? depthM < otherM : pNear >= 0.5;
-  return isNear ? ["nearer than focus", pNear] : ["beyond focus", 1 - pNear];
+	const isNear = depthM !== null && otherM !== null ? depthM < otherM : pNear >= 0.5;
+	return isNear ? ["nearer than focus", pNear] : ["beyond focus", 1 - pNear];
 }
 
 /** @param {number} share */
 function percent(share) {
-  return `${Math.round(100 * share)}\u00a0%`;
+	return `${Math.round(100 * share)}\u00a0%`;
 }

@@ -18,13 +18,13 @@ const RULER_MM = 100;
 
 /** @type {Sheet} */
 export const SHEET = {
-  kind: "asymmetric_circles",
-  rows: "11",
-  columns: "4",
-  spacing_mm: "20",
-  diameter_mm: "12",
-  paper: "a4",
-  ruler_mm: "100",
+	kind: "asymmetric_circles",
+	rows: "11",
+	columns: "4",
+	spacing_mm: "20",
+	diameter_mm: "12",
+	paper: "a4",
+	ruler_mm: "100",
 };
 
 /**
@@ -34,140 +34,138 @@ export const SHEET = {
  * @returns {{kind: string, rows: number, columns: number, spacing_mm: number, diameter_mm: number}}
  */
 export function patternOf({ kind, rows, columns, spacing_mm, diameter_mm, ruler_mm }) {
-  const scale = decimal(ruler_mm) / RULER_MM;
-  const printed = (/** @type {string} */ length) => Number((decimal(length) * scale).toPrecision(6));
-  return {
-    kind,
-    rows: decimal(rows),
-    columns: decimal(columns),
-    spacing_mm: printed(spacing_mm),
-    diameter_mm: printed(diameter_mm),
-  };
+	const scale = decimal(ruler_mm) / RULER_MM;
+	const printed = (/** @type {string} */ length) => Number((decimal(length) * scale).toPrecision(6));
+	return {
+		kind,
+		rows: decimal(rows),
+		columns: decimal(columns),
+		spacing_mm: printed(spacing_mm),
+		diameter_mm: printed(diameter_mm),
+	};
 }
 
 /** @param {Sheet} sheet */
 export function isMeasured({ ruler_mm }) {
-  return decimal(ruler_mm) >= 50 && decimal(ruler_mm) <= 200;
+	return decimal(ruler_mm) >= 50 && decimal(ruler_mm) <= 200;
 }
 
-/**
- * @param {{sheet: Sheet, onChange: (sheet: Sheet) => void, onNext: () => void}} props
- */
+/** @param {{sheet: Sheet, onChange: (sheet: Sheet) => void, onNext: () => void}} props */
 export function SheetStep({ sheet, onChange, onNext }) {
-  const { picture, problem } = usePicture(sheet);
-  const [failed, setFailed] = useState(/** @type {Problem | null} */ (null));
-  const isNone = problem?.status === 422;
-  const printed = patternOf(sheet);
-  const hasScale = isMeasured(sheet);
-  const fault = (/** @type {string} */ name) => problem?.errors.find(({ pointer }) => pointer === name)?.detail ?? "";
+	const { picture, problem } = usePicture(sheet);
+	const [failed, setFailed] = useState(/** @type {Problem | null} */ (null));
+	const isNone = problem?.status === 422;
+	const printed = patternOf(sheet);
+	const hasScale = isMeasured(sheet);
+	const fault = (/** @type {string} */ name) => problem?.errors.find(({ pointer }) => pointer === name)?.detail ?? "";
 
-  const field = (/** @type {keyof Sheet} */ name, /** @type {string} */ label, words = "") => html`
-    <${TextField}
-      ...${{ id: `sheet-${name}`, label, value: sheet[name], kind: "decimal", fault: fault(name), hint: words }}
-      invalid=${fault(name) !== "" || (name === "ruler_mm" && !hasScale)}
-      onInput=${(/** @type {string} */ value) => onChange({ ...sheet, [name]: value })}
-    />
-  `;
+	const field = (/** @type {keyof Sheet} */ name, /** @type {string} */ label, words = "") => html`
+		<${TextField}
+			...${{ id: `sheet-${name}`, label, value: sheet[name], kind: "decimal", fault: fault(name), hint: words }}
+			invalid=${fault(name) !== "" || (name === "ruler_mm" && !hasScale)}
+			onInput=${(/** @type {string} */ value) => onChange({ ...sheet, [name]: value })}
+		/>
+	`;
 
-  /** @param {"pdf" | "svg"} kind */
-  async function download(kind) {
-    setFailed(null);
-    try {
-      save(await getBlob(`calibrate/target.${kind}?${queryOf(sheet)}`), `camind-sheet.${kind}`);
-    } catch (error) {
-      setFailed(problemOf(error));
-    }
-  }
+	/** @param {"pdf" | "svg"} kind */
+	async function download(kind) {
+		setFailed(null);
+		try {
+			save(await getBlob(`calibrate/target.${kind}?${queryOf(sheet)}`), `camind-sheet.${kind}`);
+		} catch (error) {
+			setFailed(problemOf(error));
+		}
+	}
 
-  return html`
-    <div class="columns">
-      <div class="card">
-        <h3>Print the sheet</h3>
-        <ol class="told">
-          <li>Print at 100 %, without "fit to page".</li>
-          <li>Measure the printed ruler with a real one. It should be ${RULER_MM} mm long.</li>
-          <li>Glue the sheet to something flat.</li>
-        </ol>
-        <div class="row">
-          <button type="button" class="primary" disabled=${isNone} onClick=${() => download("pdf")}>Download PDF</button>
-          <button type="button" disabled=${isNone} onClick=${() => download("svg")}>Download SVG</button>
-        </div>
-        <${ProblemBox} problem=${failed} />
-        ${field("ruler_mm", "Measure this: the printed ruler is ... mm long", hasScale ? "" : "Between 50 and 200 mm.")}
-        ${hasScale &&
-        html`<p class="hint" aria-live="polite">
-          Circles of ${short(printed.diameter_mm, 4)} mm, ${short(printed.spacing_mm, 4)} mm apart: all distances hang on these.
-        </p>`}
-        <details>
-          <summary>Another grid or paper</summary>
-          <div class="pair">
-            <label class="field">
-              Paper
-              <select
-                value=${sheet.paper}
-                onChange=${(/** @type {any} */ event) =>
-                  onChange({ ...sheet, paper: event.target.value })}
-              >
-                <option value="a4">A4</option>
-                <option value="letter">Letter</option>
-              </select>
-            </label>
-            <label class="field">
-              Grid
-              <select
-                value=${sheet.kind}
-                onChange=${(/** @type {any} */ event) =>
-                  onChange({ ...sheet, kind: event.target.value })}
-              >
-                <option value="asymmetric_circles">every other row shifted</option>
-                <option value="symmetric_circles">in line</option>
-              </select>
-            </label>
-            ${field("rows", "Rows")} ${field("columns", "Columns")}
-            ${field("spacing_mm", "Spacing (mm)")} ${field("diameter_mm", "Diameter (mm)")}
-          </div>
-        </details>
-        ${isNone && !problem.errors.length && html`<p class="fault" role="alert">${problem.detail}</p>`}
-        <div class="row">
-          <button type="button" class="primary" disabled=${!hasScale || isNone} onClick=${onNext}>
-            Next: photographs
-          </button>
-        </div>
-      </div>
-      <figure class="card sheet">
-        ${picture
-          ? html`<img src=${picture} alt=${`The sheet: ${sheet.rows} rows and ${sheet.columns} columns of circles above a ruler`} />`
-          : html`<p class="hint">${isNone ? "There is no such sheet." : (problem?.detail ?? "Drawing the sheet ...")}</p>`}
-      </figure>
-    </div>
-  `;
+	return html`
+		<div class="columns">
+			<div class="card">
+				<h3>Print the sheet</h3>
+				<ol class="told">
+					<li>Print at 100 %, without "fit to page".</li>
+					<li>Measure the printed ruler with a real one. It should be ${RULER_MM} mm long.</li>
+					<li>Glue the sheet to something flat.</li>
+				</ol>
+				<div class="row">
+					<button type="button" class="primary" disabled=${isNone} onClick=${() => download("pdf")}>Download PDF</button>
+					<button type="button" disabled=${isNone} onClick=${() => download("svg")}>Download SVG</button>
+				</div>
+				<${ProblemBox} problem=${failed} />
+				${field("ruler_mm", "Measure this: the printed ruler is ... mm long", hasScale ? "" : "Between 50 and 200 mm.")}
+				${hasScale &&
+				html`<p class="hint" aria-live="polite">
+					Circles of ${short(printed.diameter_mm, 4)} mm, ${short(printed.spacing_mm, 4)} mm apart: all distances hang on these.
+				</p>`}
+				<details>
+					<summary>Another grid or paper</summary>
+					<div class="pair">
+						<label class="field">
+							Paper
+							<select
+								value=${sheet.paper}
+								onChange=${(/** @type {any} */ event) =>
+									onChange({ ...sheet, paper: event.target.value })}
+							>
+								<option value="a4">A4</option>
+								<option value="letter">Letter</option>
+							</select>
+						</label>
+						<label class="field">
+							Grid
+							<select
+								value=${sheet.kind}
+								onChange=${(/** @type {any} */ event) =>
+									onChange({ ...sheet, kind: event.target.value })}
+							>
+								<option value="asymmetric_circles">every other row shifted</option>
+								<option value="symmetric_circles">in line</option>
+							</select>
+						</label>
+						${field("rows", "Rows")} ${field("columns", "Columns")}
+						${field("spacing_mm", "Spacing (mm)")} ${field("diameter_mm", "Diameter (mm)")}
+					</div>
+				</details>
+				${isNone && !problem.errors.length && html`<p class="fault" role="alert">${problem.detail}</p>`}
+				<div class="row">
+					<button type="button" class="primary" disabled=${!hasScale || isNone} onClick=${onNext}>
+						Next: photographs
+					</button>
+				</div>
+			</div>
+			<figure class="card sheet">
+				${picture
+					? html`<img src=${picture} alt=${`The sheet: ${sheet.rows} rows and ${sheet.columns} columns of circles above a ruler`} />`
+					: html`<p class="hint">${isNone ? "There is no such sheet." : (problem?.detail ?? "Drawing the sheet ...")}</p>`}
+			</figure>
+		</div>
+	`;
 }
 
 /** @param {Sheet} sheet */
 function queryOf({ kind, rows, columns, spacing_mm, diameter_mm, paper }) {
-  const numbers = Object.entries({ rows, columns, spacing_mm, diameter_mm });
-  return new URLSearchParams([["kind", kind], ["paper", paper], ...numbers.map(([name, text]) => [name, text.replace(",", ".")])]);
+	const numbers = Object.entries({ rows, columns, spacing_mm, diameter_mm });
+	return new URLSearchParams([["kind", kind], ["paper", paper], ...numbers.map(([name, text]) => [name, text.replace(",", ".")])]);
 }
 
 /** @param {Sheet} sheet @returns {{picture: string | null, problem: Problem | null}} */
 function usePicture(sheet) {
-  const [state, setState] = useState({ picture: /** @type {string | null} */ (null), problem: /** @type {Problem | null} */ (null) });
-  const query = String(queryOf(sheet));
-  useEffect(() => {
-    const stop = new AbortController();
-    const timer = setTimeout(async () => {
-      try {
-        const drawn = await getBlob(`calibrate/target.svg?${query}`, { signal: stop.signal, asks: false });
-        setState({ picture: URL.createObjectURL(drawn), problem: null });
-      } catch (error) {
-        if (error instanceof Problem) setState({ picture: null, problem: error });
-      }
-    }, state.picture ? WAIT_MS : 0);
-    return () => {
-      clearTimeout(timer);
-      stop.abort();
-    };
-  }, [query, storedKey()]);
-  useEffect(() => () => void (state.picture && URL.revokeObjectURL(state.picture)), [state.picture]);
-  return state;
+	const [state, setState] = useState({ picture: /** @type {string | null} */ (null), problem: /** @type {Problem | null} */ (null) });
+	const query = String(queryOf(sheet));
+	useEffect(() => {
+		const stop = new AbortController();
+		const timer = setTimeout(async () => {
+			try {
+				const drawn = await getBlob(`calibrate/target.svg?${query}`, { signal: stop.signal, asks: false });
+				setState({ picture: URL.createObjectURL(drawn), problem: null });
+			} catch (error) {
+				if (error instanceof Problem) setState({ picture: null, problem: error });
+			}
+		}, state.picture ? WAIT_MS : 0);
+		return () => {
+			clearTimeout(timer);
+			stop.abort();
+		};
+	}, [query, storedKey()]);
+	useEffect(() => () => void (state.picture && URL.revokeObjectURL(state.picture)), [state.picture]);
+	return state;
 }

@@ -30,169 +30,169 @@ const HINT = "depth-stage-hint";
  * }} props
  */
 export function Stage(props) {
-  const { reader, size, look, bitmap, result, reading, marks, measured, onReading, onMarks, onCounts, announce } = props;
-  const stage = useRef(/** @type {HTMLElement | null} */ (null));
-  const [divider, setDivider] = useState(0);
-  const [painted, setPainted] = useState(/** @type {ImageBitmap | null} */ (null));
-  const paintPx = usePaintPx(stage, size);
-  const isDragging = useRef(false);
-  const isByKeys = useRef(false);
+	const { reader, size, look, bitmap, result, reading, marks, measured, onReading, onMarks, onCounts, announce } = props;
+	const stage = useRef(/** @type {HTMLElement | null} */ (null));
+	const [divider, setDivider] = useState(0);
+	const [painted, setPainted] = useState(/** @type {ImageBitmap | null} */ (null));
+	const paintPx = usePaintPx(stage, size);
+	const isDragging = useRef(false);
+	const isByKeys = useRef(false);
 
-  const paint = useMemo(
-    () =>
-      latest(async (/** @type {{look: typeof look, width: number, height: number}} */ about) => {
-        const { bitmap: next, counts } = await reader.ask("paint", about);
-        setPainted(next);
-        onCounts(counts);
-      }),
-    [],
-  );
-  useEffect(() => {
-    if (result && paintPx > 0) {
-      const scale = paintPx / size.width;
-      paint({ look, width: paintPx, height: Math.max(1, Math.round(size.height * scale)) });
-    } else {
-      setPainted(null);
-    }
-  }, [result, look, paintPx]);
+	const paint = useMemo(
+		() =>
+			latest(async (/** @type {{look: typeof look, width: number, height: number}} */ about) => {
+				const { bitmap: next, counts } = await reader.ask("paint", about);
+				setPainted(next);
+				onCounts(counts);
+			}),
+		[],
+	);
+	useEffect(() => {
+		if (result && paintPx > 0) {
+			const scale = paintPx / size.width;
+			paint({ look, width: paintPx, height: Math.max(1, Math.round(size.height * scale)) });
+		} else {
+			setPainted(null);
+		}
+	}, [result, look, paintPx]);
 
-  const read = useMemo(
-    () => latest(async (/** @type {Pixel} */ pixel) => onReading(await reader.ask("at", pixel))),
-    [],
-  );
+	const read = useMemo(
+		() => latest(async (/** @type {Pixel} */ pixel) => onReading(await reader.ask("at", pixel))),
+		[],
+	);
 
-  useEffect(() => {
-    if (!isByKeys.current || reading === null) return undefined;
-    const timer = setTimeout(() => announce(spoken(reading)), STILL_MS);
-    return () => clearTimeout(timer);
-  }, [reading]);
+	useEffect(() => {
+		if (!isByKeys.current || reading === null) return undefined;
+		const timer = setTimeout(() => announce(spoken(reading)), STILL_MS);
+		return () => clearTimeout(timer);
+	}, [reading]);
 
-  const pixelAt = (/** @type {PointerEvent} */ { clientX, clientY }) => {
-    const box = /** @type {HTMLElement} */ (stage.current).getBoundingClientRect();
-    const along = (/** @type {number} */ share, /** @type {number} */ length) =>
-      Math.min(length - 1, Math.max(0, Math.floor(share * length)));
-    return {
-      u: along((clientX - box.left) / box.width, size.width),
-      v: along((clientY - box.top) / box.height, size.height),
-    };
-  };
+	const pixelAt = (/** @type {PointerEvent} */ { clientX, clientY }) => {
+		const box = /** @type {HTMLElement} */ (stage.current).getBoundingClientRect();
+		const along = (/** @type {number} */ share, /** @type {number} */ length) =>
+			Math.min(length - 1, Math.max(0, Math.floor(share * length)));
+		return {
+			u: along((clientX - box.left) / box.width, size.width),
+			v: along((clientY - box.top) / box.height, size.height),
+		};
+	};
 
-  /** @param {PointerEvent} event */
-  function onPointerDown(event) {
-    const box = /** @type {HTMLElement} */ (stage.current).getBoundingClientRect();
-    const at = box.left + (divider / 100) * box.width;
-    isDragging.current = Math.abs(event.clientX - at) < DIVIDER_REACH_PX;
-    isByKeys.current = false;
-    if (!isDragging.current) return;
-    stage.current?.setPointerCapture(event.pointerId);
-    event.preventDefault();
-  }
+	/** @param {PointerEvent} event */
+	function onPointerDown(event) {
+		const box = /** @type {HTMLElement} */ (stage.current).getBoundingClientRect();
+		const at = box.left + (divider / 100) * box.width;
+		isDragging.current = Math.abs(event.clientX - at) < DIVIDER_REACH_PX;
+		isByKeys.current = false;
+		if (!isDragging.current) return;
+		stage.current?.setPointerCapture(event.pointerId);
+		event.preventDefault();
+	}
 
-  /** @param {PointerEvent} event */
-  function onPointerMove(event) {
-    if (isDragging.current) {
-      const box = /** @type {HTMLElement} */ (stage.current).getBoundingClientRect();
-      setDivider(Math.min(100, Math.max(0, (100 * (event.clientX - box.left)) / box.width)));
-    } else {
-      isByKeys.current = false;
-      if (result) read(pixelAt(event));
-    }
-  }
+	/** @param {PointerEvent} event */
+	function onPointerMove(event) {
+		if (isDragging.current) {
+			const box = /** @type {HTMLElement} */ (stage.current).getBoundingClientRect();
+			setDivider(Math.min(100, Math.max(0, (100 * (event.clientX - box.left)) / box.width)));
+		} else {
+			isByKeys.current = false;
+			if (result) read(pixelAt(event));
+		}
+	}
 
-  /** @param {PointerEvent} event */
-  function onPointerUp(event) {
-    const wasDragging = isDragging.current;
-    isDragging.current = false;
-    if (wasDragging || !result || event.button !== 0) return;
-    read(pixelAt(event));
-    mark(pixelAt(event));
-  }
+	/** @param {PointerEvent} event */
+	function onPointerUp(event) {
+		const wasDragging = isDragging.current;
+		isDragging.current = false;
+		if (wasDragging || !result || event.button !== 0) return;
+		read(pixelAt(event));
+		mark(pixelAt(event));
+	}
 
-  /** @param {Pixel} pixel a third one begins anew */
-  function mark(pixel) {
-    onMarks(marks.length === 1 ? [marks[0], pixel] : [pixel]);
-  }
+	/** @param {Pixel} pixel a third one begins anew */
+	function mark(pixel) {
+		onMarks(marks.length === 1 ? [marks[0], pixel] : [pixel]);
+	}
 
-  /** @param {KeyboardEvent} event */
-  function onKeyDown(event) {
-    if (!result || event.altKey || event.ctrlKey || event.metaKey) return;
-    const { u, v } = reading ?? { u: size.width >> 1, v: size.height >> 1 };
-    const step = event.shiftKey ? Math.ceil(Math.max(size.width, size.height) / LARGE_STEPS) : 1;
-    const moves = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, -step], ArrowDown: [0, step] };
-    const move = /** @type {Record<string, number[]>} */ (moves)[event.key];
-    if (move) {
-      const [across, down] = reading ? move : [0, 0];
-      isByKeys.current = true;
-      read({
-        u: Math.min(size.width - 1, Math.max(0, u + across)),
-        v: Math.min(size.height - 1, Math.max(0, v + down)),
-      });
-    } else if ((event.key === "Enter" || event.key === " ") && reading) {
-      mark({ u, v });
-    } else if (event.key === "Escape") {
-      onMarks([]);
-      onReading(null);
-    } else {
-      return;
-    }
-    event.preventDefault();
-  }
+	/** @param {KeyboardEvent} event */
+	function onKeyDown(event) {
+		if (!result || event.altKey || event.ctrlKey || event.metaKey) return;
+		const { u, v } = reading ?? { u: size.width >> 1, v: size.height >> 1 };
+		const step = event.shiftKey ? Math.ceil(Math.max(size.width, size.height) / LARGE_STEPS) : 1;
+		const moves = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, -step], ArrowDown: [0, step] };
+		const move = /** @type {Record<string, number[]>} */ (moves)[event.key];
+		if (move) {
+			const [across, down] = reading ? move : [0, 0];
+			isByKeys.current = true;
+			read({
+				u: Math.min(size.width - 1, Math.max(0, u + across)),
+				v: Math.min(size.height - 1, Math.max(0, v + down)),
+			});
+		} else if ((event.key === "Enter" || event.key === " ") && reading) {
+			mark({ u, v });
+		} else if (event.key === "Escape") {
+			onMarks([]);
+			onReading(null);
+		} else {
+			return;
+		}
+		event.preventDefault();
+	}
 
-  const portion = `${divider}%`;
-  return html`
-    <div
-      ref=${stage}
-      class=${`depth-stage ${result ? "depth-ready" : ""}`}
-      style=${{ aspectRatio: `${size.width} / ${size.height}`, maxWidth: `calc(78vh * ${size.width / size.height})` }}
-      tabindex=${result ? 0 : undefined}
-      role=${result ? "application" : undefined}
-      aria-label=${result ? "Depth of the photograph" : undefined}
-      aria-describedby=${result ? HINT : undefined}
-      onPointerDown=${onPointerDown}
-      onPointerMove=${onPointerMove}
-      onPointerUp=${onPointerUp}
-      onPointerLeave=${(/** @type {PointerEvent} */ event) =>
-        event.pointerType === "mouse" && !isByKeys.current && onReading(null)}
-      onKeyDown=${onKeyDown}
-    >
-      <${Bitmap} bitmap=${bitmap} name="photograph" />
-      <div class="depth-over" style=${{ clipPath: `inset(0 0 0 ${portion})` }} hidden=${painted === null}>
-        <${Bitmap} bitmap=${painted} name="depth" />
-      </div>
-      ${result &&
-      html`<div class="depth-divider" style=${{ left: portion }} aria-hidden="true"></div>
-        <${Marks} ...${{ size, reading, marks, measured }} />`}
-    </div>
-    ${result &&
-    html`<label class="depth-slide"
-        ><span>Depth</span>
-        <input
-          type="range"
-          min="0"
-          max="100"
-          value=${divider}
-          aria-label="Part of the picture that shows the photograph"
-          onInput=${(/** @type {any} */ event) => setDivider(Number(event.target.value))}
-        /><span>Photograph</span></label
-      >
-      <p id=${HINT} class="hint">
-        Point to read metres, click two points for their distance. By keys: arrows move the cross (Shift: far), Enter marks,
-        Escape clears.
-      </p>`}
-  `;
+	const portion = `${divider}%`;
+	return html`
+		<div
+			ref=${stage}
+			class=${`depth-stage ${result ? "depth-ready" : ""}`}
+			style=${{ aspectRatio: `${size.width} / ${size.height}`, maxWidth: `calc(78vh * ${size.width / size.height})` }}
+			tabindex=${result ? 0 : undefined}
+			role=${result ? "application" : undefined}
+			aria-label=${result ? "Depth of the photograph" : undefined}
+			aria-describedby=${result ? HINT : undefined}
+			onPointerDown=${onPointerDown}
+			onPointerMove=${onPointerMove}
+			onPointerUp=${onPointerUp}
+			onPointerLeave=${(/** @type {PointerEvent} */ event) =>
+				event.pointerType === "mouse" && !isByKeys.current && onReading(null)}
+			onKeyDown=${onKeyDown}
+		>
+			<${Bitmap} bitmap=${bitmap} name="photograph" />
+			<div class="depth-over" style=${{ clipPath: `inset(0 0 0 ${portion})` }} hidden=${painted === null}>
+				<${Bitmap} bitmap=${painted} name="depth" />
+			</div>
+			${result &&
+			html`<div class="depth-divider" style=${{ left: portion }} aria-hidden="true"></div>
+				<${Marks} ...${{ size, reading, marks, measured }} />`}
+		</div>
+		${result &&
+		html`<label class="depth-slide"
+				><span>Depth</span>
+				<input
+					type="range"
+					min="0"
+					max="100"
+					value=${divider}
+					aria-label="Part of the picture that shows the photograph"
+					onInput=${(/** @type {any} */ event) => setDivider(Number(event.target.value))}
+				/><span>Photograph</span></label
+			>
+			<p id=${HINT} class="hint">
+				Point to read metres, click two points for their distance. By keys: arrows move the cross (Shift: far), Enter marks,
+				Escape clears.
+			</p>`}
+	`;
 }
 
 /** @param {{bitmap: ImageBitmap | null, name: string}} props */
 function Bitmap({ bitmap, name }) {
-  const canvas = useRef(/** @type {HTMLCanvasElement | null} */ (null));
-  useEffect(() => {
-    if (!bitmap || !canvas.current) return;
-    canvas.current.width = bitmap.width;
-    canvas.current.height = bitmap.height;
-    // not drawn but handed over; what it was handed before is freed
-    canvas.current.getContext("bitmaprenderer")?.transferFromImageBitmap(bitmap);
-  }, [bitmap]);
-  return html`<canvas ref=${canvas} data-picture=${name} hidden=${bitmap === null}></canvas>`;
+	const canvas = useRef(/** @type {HTMLCanvasElement | null} */ (null));
+	useEffect(() => {
+		if (!bitmap || !canvas.current) return;
+		canvas.current.width = bitmap.width;
+		canvas.current.height = bitmap.height;
+		// not drawn but handed over; what it was handed before is freed
+		canvas.current.getContext("bitmaprenderer")?.transferFromImageBitmap(bitmap);
+	}, [bitmap]);
+	return html`<canvas ref=${canvas} data-picture=${name} hidden=${bitmap === null}></canvas>`;
 }
 
 /**
@@ -206,61 +206,57 @@ function Bitmap({ bitmap, name }) {
  * }} props
  */
 function Marks({ size, reading, marks, measured }) {
-  const x = (/** @type {number} */ u) => `${((100 * (u + 0.5)) / size.width).toFixed(3)}%`;
-  const y = (/** @type {number} */ v) => `${((100 * (v + 0.5)) / size.height).toFixed(3)}%`;
-  const [from, to] = marks;
-  const end = to ?? reading;
-  return html`
-    <svg class="depth-marks" aria-hidden="true">
-      ${from &&
-      end &&
-      ["rim", "line"].map(
-        (kind) =>
-          html`<line key=${kind} class=${kind} x1=${x(from.u)} y1=${y(from.v)} x2=${x(end.u)} y2=${y(end.v)} />`,
-      )}
-      ${marks.map(
-        ({ u, v }, at) => html`<circle key=${at} class="rim" cx=${x(u)} cy=${y(v)} r="6" />
-          <circle class="line" cx=${x(u)} cy=${y(v)} r="6" />`,
-      )}
-      ${reading &&
-      html`<g class="depth-cross">
-        <line class="rim" x1="0" y1=${y(reading.v)} x2="100%" y2=${y(reading.v)} />
-        <line class="rim" x1=${x(reading.u)} y1="0" x2=${x(reading.u)} y2="100%" />
-      </g>`}
-    </svg>
-    ${reading &&
-    html`<${Label}
-      left=${(reading.u + 0.5) / size.width}
-      top=${(reading.v + 0.5) / size.height}
-      isBelow=${reading.v < 0.85 * size.height}
-      name="reading"
-    >
-      ${reading.depthM === null ? "no answer" : `${metres(reading.depthM)} ± ${metres(reading.sigmaM ?? 0, 2)}`}
-    <//>`}
-    ${to &&
-    measured !== null &&
-    measured !== "unknown" &&
-    html`<${Label}
-      left=${((from.u + to.u) / 2 + 0.5) / size.width}
-      top=${((from.v + to.v) / 2 + 0.5) / size.height}
-      isBelow=${from.v + to.v < 0.3 * size.height}
-      name="distance"
-    >
-      ${metres(measured.distanceM)} ± ${metres(measured.sigmaM, 2)}
-    <//>`}
-  `;
+	const x = (/** @type {number} */ u) => `${((100 * (u + 0.5)) / size.width).toFixed(3)}%`;
+	const y = (/** @type {number} */ v) => `${((100 * (v + 0.5)) / size.height).toFixed(3)}%`;
+	const [from, to] = marks;
+	const end = to ?? reading;
+	return html`
+		<svg class="depth-marks" aria-hidden="true">
+			${from &&
+			end &&
+			["rim", "line"].map(
+				(kind) =>
+					html`<line key=${kind} class=${kind} x1=${x(from.u)} y1=${y(from.v)} x2=${x(end.u)} y2=${y(end.v)} />`,
+			)}
+			${marks.map(
+				({ u, v }, at) => html`<circle key=${at} class="rim" cx=${x(u)} cy=${y(v)} r="6" />
+					<circle class="line" cx=${x(u)} cy=${y(v)} r="6" />`,
+			)}
+			${reading &&
+			html`<g class="depth-cross">
+				<line class="rim" x1="0" y1=${y(reading.v)} x2="100%" y2=${y(reading.v)} />
+				<line class="rim" x1=${x(reading.u)} y1="0" x2=${x(reading.u)} y2="100%" />
+			</g>`}
+		</svg>
+		${reading &&
+		html`<${Label}
+			left=${(reading.u + 0.5) / size.width}
+			top=${(reading.v + 0.5) / size.height}
+			isBelow=${reading.v < 0.85 * size.height}
+			name="reading"
+		>
+			${reading.depthM === null ? "no answer" : `${metres(reading.depthM)} ± ${metres(reading.sigmaM ?? 0, 2)}`}
+		<//>`}
+		${to &&
+		measured !== null &&
+		measured !== "unknown" &&
+		html`<${Label}
+			left=${((from.u + to.u) / 2 + 0.5) / size.width}
+			top=${((from.v + to.v) / 2 + 0.5) / size.height}
+			isBelow=${from.v + to.v < 0.3 * size.height}
+			name="distance"
+		>
+			${metres(measured.distanceM)} ± ${metres(measured.sigmaM, 2)}
+		<//>`}
+	`;
 }
 
-/**
- * Words beside a place, inside the picture.
- *
- * @param {{left: number, top: number, isBelow: boolean, name: string, children?: any}} props
- */
+/** Words beside a place, inside the picture. @param {{left: number, top: number, isBelow: boolean, name: string, children?: any}} props */
 function Label({ left, top, isBelow, name, children }) {
-  const across = left > 0.6 ? "calc(-100% - 10px)" : "10px";
-  const down = isBelow ? "10px" : "calc(-100% - 10px)";
-  const style = { left: `${100 * left}%`, top: `${100 * top}%`, transform: `translate(${across}, ${down})` };
-  return html`<span class="depth-label" data-label=${name} style=${style} aria-hidden="true">${children}</span>`;
+	const across = left > 0.6 ? "calc(-100% - 10px)" : "10px";
+	const down = isBelow ? "10px" : "calc(-100% - 10px)";
+	const style = { left: `${100 * left}%`, top: `${100 * top}%`, transform: `translate(${across}, ${down})` };
+	return html`<span class="depth-label" data-label=${name} style=${style} aria-hidden="true">${children}</span>`;
 }
 
 /**
@@ -270,21 +266,21 @@ function Label({ left, top, isBelow, name, children }) {
  * @param {{width: number, height: number}} size
  */
 function usePaintPx(stage, size) {
-  const [px, setPx] = useState(0);
-  useEffect(() => {
-    const look = new ResizeObserver(([{ contentRect }]) => {
-      const most = (MOST_PX * size.width) / Math.max(size.width, size.height);
-      // hidden, it keeps what was painted
-      if (contentRect.width > 0) setPx(Math.round(Math.min(most, contentRect.width * devicePixelRatio)));
-    });
-    look.observe(/** @type {HTMLElement} */ (stage.current));
-    return () => look.disconnect();
-  }, [size.width, size.height]);
-  return px;
+	const [px, setPx] = useState(0);
+	useEffect(() => {
+		const look = new ResizeObserver(([{ contentRect }]) => {
+			const most = (MOST_PX * size.width) / Math.max(size.width, size.height);
+			// hidden, it keeps what was painted
+			if (contentRect.width > 0) setPx(Math.round(Math.min(most, contentRect.width * devicePixelRatio)));
+		});
+		look.observe(/** @type {HTMLElement} */ (stage.current));
+		return () => look.disconnect();
+	}, [size.width, size.height]);
+	return px;
 }
 
 /** @param {Reading} reading */
 function spoken({ u, v, depthM, sigmaM }) {
-  if (depthM === null) return `No answer at ${u}, ${v}.`;
-  return `${depthM.toFixed(3)} metres, give or take ${(sigmaM ?? 0).toFixed(2)}, at ${u}, ${v}.`;
+	if (depthM === null) return `No answer at ${u}, ${v}.`;
+	return `${depthM.toFixed(3)} metres, give or take ${(sigmaM ?? 0).toFixed(2)}, at ${u}, ${v}.`;
 }

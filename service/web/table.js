@@ -4,12 +4,12 @@ import { html } from "./vendor/preact.js";
 
 /** @param {{label: string, head: string[], numbers?: number[], children?: any}} props `numbers` are columns of numbers */
 export function Table({ label, head, numbers = [], children }) {
-  return html`<div class="table-scroll" tabindex="0" role="region" aria-label=${label}>
-    <table>
-      <thead>
-        <tr>${head.map((words, at) => html`<th scope="col" class=${numbers.includes(at) ? "number" : ""}>${words}</th>`)}</tr>
-      </thead>
-      <tbody>${children}</tbody>
-    </table>
-  </div>`;
+	return html`<div class="table-scroll" tabindex="0" role="region" aria-label=${label}>
+		<table>
+			<thead>
+				<tr>${head.map((words, at) => html`<th scope="col" class=${numbers.includes(at) ? "number" : ""}>${words}</th>`)}</tr>
+			</thead>
+			<tbody>${children}</tbody>
+		</table>
+	</div>`;
 }

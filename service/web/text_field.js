@@ -7,23 +7,23 @@ import { html } from "./vendor/preact.js";
  *   kind?: string, list?: string, disabled?: boolean, invalid?: boolean}} props
  */
 export function TextField({ id, label, value, onInput, fault = "", hint, kind, list, disabled = false, invalid = fault !== "" }) {
-  return html`
-    <div class="field">
-      <label for=${id}>${label}</label>
-      <input
-        id=${id}
-        type="text"
-        inputmode=${kind}
-        list=${list}
-        autocomplete="off"
-        spellcheck=${false}
-        value=${value}
-        disabled=${disabled}
-        aria-invalid=${invalid}
-        aria-describedby=${`${id}-told`}
-        onInput=${(/** @type {any} */ event) => onInput(event.target.value)}
-      />
-      <span id=${`${id}-told`} class=${fault ? "fault" : "hint"}>${fault || hint}</span>
-    </div>
-  `;
+	return html`
+		<div class="field">
+			<label for=${id}>${label}</label>
+			<input
+				id=${id}
+				type="text"
+				inputmode=${kind}
+				list=${list}
+				autocomplete="off"
+				spellcheck=${false}
+				value=${value}
+				disabled=${disabled}
+				aria-invalid=${invalid}
+				aria-describedby=${`${id}-told`}
+				onInput=${(/** @type {any} */ event) => onInput(event.target.value)}
+			/>
+			<span id=${`${id}-told`} class=${fault ? "fault" : "hint"}>${fault || hint}</span>
+		</div>
+	`;
 }
