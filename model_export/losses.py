@@ -1,7 +1,7 @@
 """What training minimises: L_depth + b_weight * L_blur (eq. 8), each a likelihood, so that errors are stated."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -30,7 +30,8 @@ class Batch:
     """Images [n,3,h,w] in 0..1, q - 1 = s1/z - 1 as [n,1,h,w], and per image [n] its camera and side (-1/0/+1).
 
     ``told_gamma_px`` is what the correction is given: a guess where gamma is not known. ``side`` is the one
-    asked for, 0 for both: the other may be in the picture.
+    asked for, 0 for both: the other may be in the picture. ``place`` in 0..1 is which pixel of a network's cell its
+    truth is, down and across: any at times, for always the first would move all answers by half a pixel.
     """
 
     image: Tensor
@@ -41,6 +42,7 @@ class Batch:
     focus_distance_m: Tensor
     focal_length_px: Tensor
     side: Tensor
+    place: tuple[float, float] = field(default=(0.0, 0.0), kw_only=True)
 
     def scene(self) -> Scene:
         return Scene(self.focus_distance_m, self.focal_length_px, self.side)
@@ -73,9 +75,10 @@ def run_pair(pair: Pair, batch: Batch) -> tuple[BlurEstimate, DepthEstimate]:
     return blur, depth
 
 
-def _reduced(excess: Tensor, stride: int) -> Tensor:
+def reduced(excess: Tensor, stride: int, place: tuple[float, float]) -> Tensor:
     """Truth at the networks' resolution: one pixel of each cell, since a mean across a depth edge is no depth."""
-    return excess[:, :, ::stride, ::stride]
+    down, across = (int(part * stride) for part in place)
+    return excess[:, :, down::stride, across::stride]
 
 
 def standing_out(log_truth: Tensor, emphasis: float = 1.0) -> Tensor:
@@ -128,7 +131,7 @@ def total_loss(
     ``emphasis`` is that of what stands out.
     """
     blur, depth = run_pair(pair, batch)
-    excess = _reduced(batch.excess, pair.stride).float()
+    excess = reduced(batch.excess, pair.stride, batch.place).float()
     defocus_px = excess.abs() * batch.k_cam_px[:, None, None, None]
     true_blur = thin_lens.blur_from_defocus(defocus_px, batch.gamma_px[:, None, None, None])
     blur_error = (torch.log(blur.blur_px) - torch.log(true_blur)).abs()

@@ -15,7 +15,6 @@ import torch
 from numpy.typing import NDArray
 
 from model_export.config import SceneConfig
-from model_export.datasets.photos import filled
 from model_export.frames import Frame, draw_view
 from model_export.render import Layer, PointSpread, blur, render_layers, sliced
 from model_export.rooms import Surface, draw_room
@@ -322,14 +321,14 @@ def _frame_layers(
     excess = np.float32(focus_m) / depth_m - 1
     most = float(np.quantile(np.abs(excess), MOSTLY))
     k_cam_px = max(config.k_cam_px[0], min(shot.k_cam_px, config.defocus_px[1] / max(most, 1e-6)))
-    layers, index = sliced(light, -excess * np.float32(k_cam_px))
+    layers, _ = sliced(light, -excess * np.float32(k_cam_px))
     # no camera's picture of it is sharper than it is itself
     gamma_px = max(shot.gamma_px, math.sqrt(thin_lens.PIXEL_BOX_VARIANCE + softness))
     shot = replace(
         shot, k_cam_px=k_cam_px, gamma_px=gamma_px, focus_distance_m=focus_m, focal_length_px=focal_length_px, side=0
     )
-    found = [filled(np.where(index == n, excess, np.float32(np.nan))) for n in range(len(layers))]
-    return shot, layers, np.stack(found), softness
+    found = torch.stack([layer.defocus_px for layer in layers]).numpy() / np.float32(-k_cam_px)
+    return shot, layers, found, softness
 
 
 def draw_sample(seed: int, config: SceneConfig, material: Material = NOTHING) -> Sample:

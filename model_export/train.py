@@ -41,7 +41,6 @@ TURNED_SHARE = 0.3  # most are left upright: below is nearer, as in most photogr
 # a camera known by its specs has a guess for gamma: mostly too low a one, since motion, haze and filters add softness
 GUESSED_GAMMA_SHARE, GUESSED_GAMMA = 0.6, (-0.2, 0.35)  # mean and standard deviation of the guess's log error
 HELD_OUT_SEED = 2**40
-CELL = 2  # pixels of a network's cell that one is taken of
 
 
 class SceneStream(Dataset[Sample]):
@@ -123,9 +122,7 @@ def collate(samples: list[Sample], rng: np.random.Generator) -> Batch:
         turns = int(rng.integers(4)) if rng.random() < TURNED_SHARE else 0
         flip = int(rng.choice([-1, 1]))
         images.append(np.rot90(sample.image, turns, (1, 2))[:, :, ::flip].copy())
-        # any pixel of a network's cell may be its truth: always the first would move all answers by half a pixel
-        cell = tuple(-rng.integers(0, CELL, 2))
-        excesses.append(np.roll(np.rot90(sample.excess, turns)[:, ::flip], cell, (0, 1)).astype(np.float32))
+        excesses.append(np.rot90(sample.excess, turns)[:, ::flip].astype(np.float32))
         shot = sample.shot
         focal = 0.0 if rng.random() < FOCAL_UNKNOWN_SHARE else shot.focal_length_px
         side = (shot.side or int(rng.choice([-1, 1]))) if rng.random() < SIDE_HINT_SHARE else 0
@@ -134,7 +131,9 @@ def collate(samples: list[Sample], rng: np.random.Generator) -> Batch:
     columns = torch.tensor(rows, dtype=torch.float32).unbind(1)
     image = torch.from_numpy(np.stack(images)).float() / 255
     excess = torch.from_numpy(np.stack(excesses))[:, None]
-    return Batch(image.contiguous(memory_format=torch.channels_last), excess, *columns)
+    return Batch(
+        image.contiguous(memory_format=torch.channels_last), excess, *columns, place=(rng.random(), rng.random())
+    )
 
 
 def held_out(scenes: SceneConfig, material: Material, count: int) -> Batch:

@@ -165,7 +165,7 @@ class Estimator:
         self, rgb: NDArray[np.uint8], working: Camera, side: Side, cancellation: Cancellation, stopwatch: Stopwatch
     ) -> Read:
         """What a copy shows that is as large as that camera's pictures, and for strong blur one of half its size."""
-        maps = self._read(rgb, working, side, cancellation, stopwatch)
+        maps = self._read_copy(rgb, working, side, cancellation, stopwatch)
         most_blur_px = self.manifest.ranges.blur_px.high
         if not self._shows_strong_blur(maps, working):
             return Read(maps, working, (working.image_width_px,), most_blur_px)
@@ -173,12 +173,12 @@ class Estimator:
         ratio = Ratio.between(
             (working.image_height_px, working.image_width_px), (coarser.image_height_px, coarser.image_width_px), 1
         )
-        told = self._read(rgb, coarser, side, cancellation, stopwatch)
+        told = self._read_copy(rgb, coarser, side, cancellation, stopwatch)
         with stopwatch.stage("correct"):
             blend(maps, told, ratio, self._strong_px)
         return Read(maps, working, (working.image_width_px, coarser.image_width_px), most_blur_px / COARSER)
 
-    def _read(
+    def _read_copy(
         self, rgb: NDArray[np.uint8], working: Camera, side: Side, cancellation: Cancellation, stopwatch: Stopwatch
     ) -> RawMaps:
         """The maps of a copy as large as that camera's pictures."""

@@ -1,6 +1,7 @@
 /** What a set of photographs of the sheet lacks yet, and the one to take next, in words. */
 
 import { short } from "./numbers.js";
+import { upright } from "./photograph_files.js";
 
 /**
  * @typedef {object} Seen a photograph in which the grid was found
@@ -26,20 +27,6 @@ const SIDE = 1.12; // times the focus distance: nearer than 1/1.12 and farther t
 const NEARER = [0.6, 0.8];
 /** @type {Between} */
 const FARTHER = [1.25, 1.7];
-
-/**
- * A place of the stored frame in the upright photograph.
- *
- * @param {number} x
- * @param {number} y
- * @param {number} orientation of EXIF
- * @param {number} width of the stored frame
- * @param {number} height
- */
-export function upright(x, y, orientation, width, height) {
-	const [left, up] = [width - x, height - y];
-	return /** @type {[number, number][]} */ ([[x, y], [left, y], [left, up], [x, up], [y, x], [up, x], [up, left], [y, left]])[orientation - 1];
-}
 
 /**
  * How many circles were in each part of the frame, which is shown as the newest photograph is held.

@@ -2,9 +2,9 @@
 
 import { Problem, getJson, problemOf } from "./api.js";
 import { Chart } from "./chart.js";
-import { WANTED, adviceFor, coverageOf, focusOf, upright } from "./guidance.js";
+import { WANTED, adviceFor, coverageOf, focusOf } from "./guidance.js";
 import { counted, measure } from "./numbers.js";
-import { PHOTOGRAPHS, mediaTypeOf, readShown } from "./photograph_files.js";
+import { PHOTOGRAPHS, mediaTypeOf, readShown, upright } from "./photograph_files.js";
 import { html, useEffect, useRef, useState } from "./vendor/preact.js";
 
 const THUMB_PX = 320;

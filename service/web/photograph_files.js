@@ -25,3 +25,17 @@ export async function readShown(file, longestPx, read) {
 	const preview = await getBlob(`photographs/preview?longest_px=${longestPx}`, about).catch(() => null);
 	return preview && read(preview);
 }
+
+/**
+ * A place of the stored frame in the upright photograph.
+ *
+ * @param {number} x
+ * @param {number} y
+ * @param {number} orientation of EXIF
+ * @param {number} width of the stored frame
+ * @param {number} height
+ */
+export function upright(x, y, orientation, width, height) {
+	const [left, up] = [width - x, height - y];
+	return /** @type {[number, number][]} */ ([[x, y], [left, y], [left, up], [x, up], [y, x], [up, x], [up, left], [y, left]])[orientation - 1];
+}

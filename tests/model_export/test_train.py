@@ -16,7 +16,7 @@ from rich.console import Console
 from model_export.config import SceneConfig, TrainConfig
 from model_export.cores import torch_threads
 from model_export.folded import folded
-from model_export.losses import run_pair, told_by, total_loss
+from model_export.losses import reduced, run_pair, told_by, total_loss
 from model_export.networks import Widths, make_pair, with_fresh_decoders
 from model_export.restored import restored, spread_norms
 from model_export.scenes import Material, draw_sample
@@ -243,12 +243,16 @@ def test_several_teachers_answer_as_their_mean() -> None:
     assert not torch.equal(one.near_logit, other.near_logit)
 
 
-def test_any_pixel_of_a_cell_is_its_truth_at_times() -> None:
-    names = np.arange(64) % 2 + 2 * (np.arange(64)[:, None] % 2)
-    sample = replace(draw_sample(0, SceneConfig(size_px=64, margin_px=24)), excess=names.astype(np.float16))
-    cells = [collate([sample], np.random.default_rng(seed)).excess[0, 0, ::2, ::2] for seed in range(40)]
-    assert all(cell.min() == cell.max() for cell in cells)
-    assert {float(cell[0, 0]) for cell in cells} == {0.0, 1.0, 2.0, 3.0}
+def test_any_pixel_of_a_cell_is_its_truth_at_times_and_of_no_cell_another_s() -> None:
+    sample = draw_sample(0, SCENES)
+    names = torch.arange(2)[:, None] * 2 + torch.arange(2)
+    excess = names.repeat(8, 8)[None, None].float()
+    places = [collate([sample], np.random.default_rng(seed)).place for seed in range(40)]
+    cells = [reduced(excess, 2, place) for place in places]
+    assert all(cell.shape[-2:] == (8, 8) and cell.min() == cell.max() for cell in cells)
+    assert {float(cell.max()) for cell in cells} == {0.0, 1.0, 2.0, 3.0}
+    for place in places:  # the paper's networks answer every pixel
+        torch.testing.assert_close(reduced(excess, 1, place), excess)
 
 
 def test_the_learning_rate_warms_up_holds_and_falls_to_nothing() -> None:
