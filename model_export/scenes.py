@@ -327,7 +327,7 @@ def _frame_layers(
     shot = replace(
         shot, k_cam_px=k_cam_px, gamma_px=gamma_px, focus_distance_m=focus_m, focal_length_px=focal_length_px, side=0
     )
-    found = torch.stack([layer.defocus_px for layer in layers]).numpy() / np.float32(-k_cam_px)
+    found = (torch.stack([layer.defocus_px for layer in layers]).numpy() / -k_cam_px).astype(np.float32)
     return shot, layers, found, softness
 
 
