@@ -214,11 +214,15 @@ def _spread(folder: Path, count: int) -> Iterator[Photo]:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A named set, and the modes (see ``evaluate.MODES``) in which its pictures are answered."""
+    """A named set, and the modes (see ``evaluate.MODES``) in which its pictures are answered.
+
+    With ``oracle`` they are also answered with the one factor on all k_cam that the truth likes best.
+    """
 
     name: str
     cases: CaseSource
     modes: tuple[str, ...] = ("gt",)
+    oracle: bool = False
 
 
 def _enough(source: CaseSource) -> Iterator[Case]:
@@ -234,14 +238,15 @@ def trials(data: Path, quick: bool) -> list[Trial]:
         _trial(f"procedural {n}", partial(procedural_cases, scenes, side)) for n, side in PROCEDURAL_SIDES.items()
     ]
     if (data / "blender" / "cameras.json").is_file():
-        found.append(_trial("blender", partial(blender_cases, data / "blender", 2 * scenes)))
+        found.append(_trial("blender", partial(blender_cases, data / "blender", 2 * scenes), "right side"))
     indoor = [data / name for name in ("rgbd", "tabletop") if (data / name).is_dir()]
     if len(indoor) == 2:
         found += [_trial(f"plane {depth_m:g} m", partial(plane_cases, data, depth_m, few)) for depth_m in PLANES_M]
     for folder in indoor:
         found += _indoor_trials(folder, quick)
     if (data / "d200").is_dir():
-        found.append(_trial("d200", partial(d200_cases, data / "d200", 2 * many)))
+        source = partial(d200_cases, data / "d200", 2 * many)
+        found.append(replace(_trial("d200", source, "right side"), oracle=True))
     return found
 
 

@@ -19,7 +19,7 @@ from model_export.cores import torch_threads
 from model_export.metrics import Scores, best_constant, completed, mean_scores, pooled_scores, score
 from service.inference.artifact import ModelFolder, load_model_folder
 from service.inference.cancellation import Cancellation
-from service.inference.depth_map import DepthMap
+from service.inference.depth_map import DepthMap, Layers
 from service.inference.estimator import Estimator
 from service.inference.hypotheses import SIGMA_OF_LAPLACE
 from service.inference.pair import GraphPair, RawMaps
@@ -33,6 +33,9 @@ MODES: dict[str, Callable[[float], float]] = {
     "k_cam -10%": lambda k_cam_px: 0.9 * k_cam_px,
     "k_cam +10%": lambda k_cam_px: 1.1 * k_cam_px,
 }
+# what no user has: they tell how much of an error is the camera's, and how much the side's
+RIGHT_SIDE, ORACLE_K_CAM = "right side", "oracle k_cam"
+ORACLE_FACTORS = (0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.4, 1.6)
 BLUR_RANGES_PX = (
     *((0.0, 0.5), (0.5, 1.0), (1.0, 2.0), (2.0, 4.0), (4.0, 8.0), (8.0, 16.0), (16.0, math.inf)),
     *((0.6, 1.0), (1.0, 8.0), (0.0, math.inf)),
@@ -293,8 +296,27 @@ class Examiner:
 
     def answer(self, case: Case, mode: str = "gt") -> tuple[Outcome, Example]:
         """Run a case through the estimator, with the camera as the mode tells it, and score the answer."""
-        camera = replace(case.camera, k_cam_px=MODES[mode](case.camera.k_cam_px))
-        told = self._estimator.estimate(case.image, camera, case.side)
+        if mode == RIGHT_SIDE:
+            return self._scored(case, self._rightly_sided(case))
+        return self.told(case, MODES[mode](case.camera.k_cam_px), blur=mode == "gt")
+
+    def told(self, case: Case, k_cam_px: float, *, blur: bool = False) -> tuple[Outcome, Example]:
+        """Score the answer to a case whose camera is said to have that k_cam, and its lambda where asked to."""
+        answered = self._estimator.estimate(case.image, replace(case.camera, k_cam_px=k_cam_px), case.side)
+        return self._scored(case, answered, self._blur(case) if blur else None)
+
+    def _rightly_sided(self, case: Case) -> DepthMap:
+        """Each pixel answered on the side that its truth is on; where there is none, on the far one."""
+        near, far = (self._estimator.estimate(case.image, case.camera, side) for side in ("near", "far"))
+        is_near = case.truth_m < case.camera.focus_distance_m
+
+        def layers() -> Layers:
+            both = [(getattr(near, name), getattr(far, name)) for name in Layers.__slots__]
+            return Layers(*(np.where(is_near, *sides) for sides in both))
+
+        return replace(far, depth_m=np.where(is_near, near.depth_m, far.depth_m), layers=layers)
+
+    def _scored(self, case: Case, told: DepthMap, blur: Pixels | None = None) -> tuple[Outcome, Example]:
         scored = np.isfinite(case.truth_m)
         truth, depth = case.truth_m[scored], completed(told.depth_m)[scored]
         stated = np.nan_to_num(told.sigma_m / told.depth_m, nan=np.inf)[scored]
@@ -309,7 +331,7 @@ class Examiner:
             depth=Pixels(truth[some], depth[some], stated[some]),
             depth_blur_px=thin_lens.blur_from_defocus(defocus * case.camera.k_cam_px, case.camera.gamma_px),
             depth_defocus=defocus,
-            blur=self._blur(case) if mode == "gt" else None,
+            blur=blur,
             sides=_sides(case, told) if case.side == "auto" else None,
         )
         return outcome, Example(case.image, case.truth_m, told.depth_m, told.sigma_m)
@@ -417,13 +439,19 @@ class _Examined:
 def _examined(model: Path, on_progress: Callable[[str, int], None], trial: Trial) -> _Examined:
     examiner = Examiner(model)
     outcomes: dict[str, list[Outcome]] = {}
+    searched: dict[float, list[Outcome]] = {}
     first: Example | None = None
     for case in trial.cases():
         for mode in trial.modes:
             outcome, example = examiner.answer(case, mode)
             outcomes.setdefault(mode, []).append(outcome)
             first = first or example
+        for factor in ORACLE_FACTORS if trial.oracle else ():
+            searched.setdefault(factor, []).append(examiner.told(case, factor * case.camera.k_cam_px)[0])
         on_progress(f"{trial.name}: {case.name}", 0)
+    if searched:
+        best = min(searched, key=lambda factor: mean_scores([o.scores for o in searched[factor]]).abs_rel)
+        outcomes[f"{ORACLE_K_CAM}, x {best:g}"] = searched[best]
     on_progress(trial.name, 1)
     return _Examined(trial.name, outcomes, first)
 

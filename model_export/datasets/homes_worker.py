@@ -22,9 +22,10 @@ TRIES = 8
 NEAREST_M = 0.2
 EMPTY_SHARE = 0.005
 THING_M = 0.6  # what is smaller stands on tables
-OWN_PAINT_SHARE = 0.55
-PAINTED_WALLS = 0.45
-PLAIN_SHARE, FAINT_SHARE = 0.4, 0.3
+OWN_PAINT_SHARE = 0.8
+PAINTED_WALLS = 0.75
+PLAIN_SHARE, FAINT_SHARE = 0.4, 0.5
+SUNNY_SHARE = 0.35
 FAINT = (0.02, 0.3)
 
 
@@ -213,6 +214,12 @@ def light(dice, size):
         thing = bpy.data.objects.new(lamp.name, lamp)
         thing.location = (*(dice.uniform(-0.45, 0.45) * side for side in size[:2]), size[2] * dice.uniform(0.7, 0.98))
         thing.rotation_euler = [dice.gauss(0, 0.5), dice.gauss(0, 0.5), 0]
+        bpy.context.scene.collection.objects.link(thing)
+    if dice.random() < SUNNY_SHARE:
+        sun = bpy.data.lights.new("sun", "SUN")
+        sun.energy, sun.angle = dice.uniform(1, 6), dice.uniform(0.01, 0.1)
+        thing = bpy.data.objects.new(sun.name, sun)
+        thing.rotation_euler = [dice.uniform(0.4, 1.3), 0, dice.uniform(0, 6.3)]
         bpy.context.scene.collection.objects.link(thing)
     level = math.exp(dice.uniform(math.log(0.1), math.log(1.0)))
     bpy.context.scene.world = sky([level * dice.uniform(0.85, 1) for _ in range(3)])

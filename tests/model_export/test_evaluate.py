@@ -10,9 +10,19 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from model_export.cases import REFERENCE, Case, d200_cases, procedural_cases, shuffled_cases, viewed_cases
+from model_export.cases import REFERENCE, Case, Trial, d200_cases, procedural_cases, shuffled_cases, viewed_cases
 from model_export.cli import commands
-from model_export.evaluate import EQUAL_BLUR_PX, Examiner, Pixels, Relief, Sides, blur_ranges, summarise
+from model_export.evaluate import (
+    EQUAL_BLUR_PX,
+    RIGHT_SIDE,
+    Examiner,
+    Pixels,
+    Relief,
+    Sides,
+    blur_ranges,
+    evaluate,
+    summarise,
+)
 from model_export.temperature import STRANGER, calibrate, temperature
 from service.inference.artifact import Interval, load_model_folder
 from service.optics import thin_lens
@@ -74,6 +84,23 @@ def test_a_wrong_k_cam_is_told_to_the_estimator(oracle: Examiner) -> None:
     x = CAMERA.focus_distance_m / right.truth_m[0, -1] - 1
     outcome, _ = oracle.answer(right, "k_cam +10%")
     assert outcome.median_error == pytest.approx((1 + x) / (1 + x / 1.1) - 1, rel=1e-3)
+
+
+def test_the_right_side_is_that_of_each_pixel(oracle: Examiner) -> None:
+    """Half of a wall as far behind the plane in focus as the other half is before it, in blur."""
+    both = replace(case(1.0), side="auto")
+    x = thin_lens.relative_defocus_from_blur(blur_of(LEVEL), CAMERA.gamma_px, CAMERA.k_cam_px)
+    both.truth_m[:, 48:] = thin_lens.depth_far(x, CAMERA.focus_distance_m)
+    assert oracle.answer(both, RIGHT_SIDE)[0].scores.abs_rel == pytest.approx(0, abs=1e-3)
+    assert oracle.answer(both)[0].scores.abs_rel > 0.2
+
+
+def test_the_oracle_finds_the_one_factor_that_all_pictures_like_best(tiny_model_dir: Path) -> None:
+    wrong = replace(CAMERA, k_cam_px=CAMERA.k_cam_px / 1.25)
+    pictures = [replace(case(1.0), camera=wrong) for _ in range(2)]
+    report = evaluate(tiny_model_dir, [Trial("grey", lambda: iter(pictures), oracle=True)])
+    assert report.summary("grey").mean.abs_rel > 0.05
+    assert report.summary("grey", "oracle k_cam, x 1.25").mean.abs_rel == pytest.approx(0, abs=1e-3)
 
 
 def test_certainty_and_blur_are_scored_where_they_are_known(oracle: Examiner) -> None:
