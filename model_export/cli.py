@@ -77,6 +77,10 @@ def train(
         ),
     ] = None,
     learning_rate: Annotated[float, typer.Option(min=1e-6, max=1e-2, help="before it falls")] = 1e-3,
+    setting: Annotated[
+        list[str] | None,
+        typer.Option(help="anything else of the run: decay_share=0.8, scenes.frame_share=0.5, scenes.k_cam_px=[1,20]"),
+    ] = None,
     workers: Annotated[int, typer.Option(min=0, max=64, help="processes that draw scenes")] = 1,
     device: Annotated[str, typer.Option(help="torch device")] = "cpu",
 ) -> None:
@@ -87,12 +91,12 @@ def train(
 
     if kind not in {"compact", "paper"}:
         raise _fail(f"--kind is compact or paper, not {kind}")
-    config = TrainConfig(
+    plain = TrainConfig(
         kind="paper" if kind == "paper" else "compact", seed=seed, steps=steps, learning_rate=learning_rate
     )
     try:
         path = run_training(
-            config,
+            plain.adjusted(setting or ()),
             textures,
             run,
             frames=frames,

@@ -1,8 +1,11 @@
 """One config for a training run; it travels inside every checkpoint and the manifest."""
 
 import json
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
+
+from pydantic import TypeAdapter, ValidationError
 
 Kind = Literal["compact", "paper"]
 
@@ -89,3 +92,25 @@ class TrainConfig:
             name: tuple(value) if isinstance(value, list) else value for name, value in values["scenes"].items()
         }
         return cls(**{**values, "scenes": SceneConfig(**scenes)})
+
+    def adjusted(self, settings: Iterable[str]) -> "TrainConfig":
+        """This one with values given as ``name=JSON``, those of the scenes as ``scenes.name=JSON``.
+
+        Raises ``ValueError`` for a name that it does not have, or a value of another kind.
+        """
+        values = self.as_dict()
+        for setting in settings:
+            name, _, value = setting.partition("=")
+            within = values["scenes"] if name.startswith("scenes.") else values
+            own = name.removeprefix("scenes.")
+            if own not in within or not value:
+                raise ValueError(f"{setting} sets nothing: it is name=value, with a name of {', '.join(within)}")
+            try:
+                within[own] = json.loads(value)
+            except json.JSONDecodeError as exc:
+                raise ValueError(f"{setting}: {value} is neither a number nor other JSON") from exc
+        try:
+            return TypeAdapter(TrainConfig).validate_python(values)
+        except ValidationError as exc:
+            wrong = exc.errors(include_url=False)[0]
+            raise ValueError(f"{'.'.join(map(str, wrong['loc']))}: {wrong['msg']}") from exc

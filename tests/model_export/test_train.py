@@ -41,6 +41,27 @@ CONFIG = TrainConfig(
 )
 
 
+def test_anything_of_a_run_can_be_set() -> None:
+    told = TrainConfig().adjusted(["decay_share=0.8", "scenes.k_cam_px=[1,20]"])
+    assert told == replace(TrainConfig(), decay_share=0.8, scenes=replace(TrainConfig().scenes, k_cam_px=(1, 20)))
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("decay=0.8", "decay=0.8 sets nothing.*decay_share"),
+        ("scenes.steps=1", "sets nothing.*frame_share"),
+        ("batch", "sets nothing"),
+        ("batch=many", "many is neither a number"),
+        ("batch=0.5", "batch: .*integer"),
+        ("scenes.k_cam_px=[1]", "scenes.k_cam_px.1: "),
+    ],
+)
+def test_what_is_no_setting_is_refused_by_name(setting: str, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        TrainConfig().adjusted([setting])
+
+
 @pytest.fixture
 def textures(tmp_path: Path) -> Path:
     folder = tmp_path / "textures"
