@@ -110,7 +110,10 @@ def told_by(teachers: Sequence[Pair], batch: Batch) -> tuple[BlurEstimate, Depth
 
 
 def likeness_loss(blur: BlurEstimate, depth: DepthEstimate, teachers: Sequence[Pair], batch: Batch) -> Tensor:
-    """How far the answers are from the teachers', most where these are sure: float32 scalar."""
+    """How far the answers are from the teachers', most where these are sure: float32 scalar.
+
+    But for the side: how often it is near is that of the scenes a teacher saw.
+    """
     wise_blur, wise_depth = told_by(teachers, batch)
     sure_blur = torch.exp(-BETA * wise_blur.log_error)
     sure_depth = torch.exp(-BETA * wise_depth.log_scale) / 2
@@ -118,9 +121,7 @@ def likeness_loss(blur: BlurEstimate, depth: DepthEstimate, teachers: Sequence[P
     of_near = sure_depth * (depth.log_ratio_near - wise_depth.log_ratio_near).abs()
     of_far = sure_depth * (depth.log_ratio_far - wise_depth.log_ratio_far).abs()
     of_errors = (blur.log_error - wise_blur.log_error).abs() + (depth.log_scale - wise_depth.log_scale).abs()
-    p_near = torch.sigmoid(wise_depth.near_logit)
-    of_side = functional.binary_cross_entropy_with_logits(depth.near_logit, p_near)
-    return (of_blur + of_near + of_far + of_errors / 2).mean() + of_side / 2
+    return (of_blur + of_near + of_far + of_errors / 2).mean()
 
 
 def total_loss(

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from model_export.config import SceneConfig
-from model_export.frames import Frame, draw_view
+from model_export.frames import Frame, draw_frame, draw_view
 from model_export.render import Layer, PointSpread, blur, render_layers, sliced
 from model_export.rooms import Surface, draw_room
 from model_export.textures import draw_texture
@@ -336,8 +336,7 @@ def draw_sample(seed: int, config: SceneConfig, material: Material = NOTHING) ->
     rng = np.random.default_rng(seed)
     shot = draw_shot(rng, config)
     if material.frames and rng.random() < config.frame_share:
-        frame = material.frames[int(rng.integers(len(material.frames)))]
-        shot, layers, excesses, softness = _frame_layers(rng, shot, config, frame)
+        shot, layers, excesses, softness = _frame_layers(rng, shot, config, draw_frame(rng, material.frames))
         return Sample(*_photograph(rng, shot, config, layers, excesses, softness), shot)
     if rng.random() >= RESCALED_SHARE:
         return Sample(*_photograph(rng, shot, config, *draw_layers(rng, shot, config, material.photographs)), shot)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from model_export.config import SceneConfig
-from model_export.frames import Frame, draw_view
+from model_export.frames import Frame, draw_frame, draw_view
 from model_export.render import sliced
 from model_export.scenes import Material, draw_sample, true_blur_px
 
@@ -31,6 +31,14 @@ def test_a_view_shows_what_it_says_the_depth_of(size: int) -> None:
         assert 0.65 * 130 <= focal_length_px <= 130
         dark = light[..., 1] < light[..., 1].max() / 4 if np.ptp(depth_m) > 0 else depth_m < 2
         assert (dark == (depth_m < 2)).mean() > 0.97  # all but the edge
+
+
+def test_frames_that_look_far_are_drawn_more_often() -> None:
+    """One that looks four times as far eight times as often."""
+    near, far = frame(0.5, 0.5), frame(2.0, 2.0)
+    rng = np.random.default_rng(0)
+    share = np.mean([draw_frame(rng, [near, far]) is far for _ in range(2000)])
+    assert share == pytest.approx(8 / 9, abs=0.025)
 
 
 def test_frames_are_half_of_the_scenes_and_keep_their_metres() -> None:

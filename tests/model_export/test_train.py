@@ -16,7 +16,7 @@ from rich.console import Console
 from model_export.config import SceneConfig, TrainConfig
 from model_export.cores import torch_threads
 from model_export.folded import folded
-from model_export.losses import reduced, run_pair, told_by, total_loss
+from model_export.losses import likeness_loss, reduced, run_pair, told_by, total_loss
 from model_export.networks import Widths, make_pair, with_fresh_decoders
 from model_export.restored import restored, spread_norms
 from model_export.scenes import Material, draw_sample
@@ -262,6 +262,23 @@ def test_several_teachers_answer_as_their_mean() -> None:
     torch.testing.assert_close(blur.blur_px, (one_blur.blur_px * other_blur.blur_px).sqrt())
     torch.testing.assert_close(depth.log_ratio_far, (one.log_ratio_far + other.log_ratio_far) / 2)
     assert not torch.equal(one.near_logit, other.near_logit)
+
+
+def test_the_side_is_learned_from_the_truth_alone() -> None:
+    """How often it is near is that of a teacher's own scenes."""
+    batch = collate([draw_sample(seed, SCENES) for seed in range(2)], np.random.default_rng(0))
+    wise, pair = make_pair("compact"), make_pair("compact")
+    for one in (wise, pair):
+        one.modules().eval()
+    with torch.no_grad():
+        before, bias = (
+            likeness_loss(*run_pair(pair, batch), [wise], batch),
+            wise.modules().get_parameter("depth.head.bias"),
+        )
+        bias[3] += 4
+        assert torch.equal(likeness_loss(*run_pair(pair, batch), [wise], batch), before)
+        bias[0] += 4
+        assert not torch.equal(likeness_loss(*run_pair(pair, batch), [wise], batch), before)
 
 
 def test_any_pixel_of_a_cell_is_its_truth_at_times_and_of_no_cell_another_s() -> None:
