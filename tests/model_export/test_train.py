@@ -271,10 +271,8 @@ def test_the_side_is_learned_from_the_truth_alone() -> None:
     for one in (wise, pair):
         one.modules().eval()
     with torch.no_grad():
-        before, bias = (
-            likeness_loss(*run_pair(pair, batch), [wise], batch),
-            wise.modules().get_parameter("depth.head.bias"),
-        )
+        before = likeness_loss(*run_pair(pair, batch), [wise], batch)
+        bias = wise.modules().get_parameter("depth.head.bias")
         bias[3] += 4
         assert torch.equal(likeness_loss(*run_pair(pair, batch), [wise], batch), before)
         bias[0] += 4
