@@ -143,7 +143,9 @@ def average(
     first: Annotated[Path, typer.Argument(help="checkpoint file", exists=True, dir_okay=False)],
     second: Annotated[Path, typer.Argument(help="checkpoint file", exists=True, dir_okay=False)],
     out: Annotated[Path, typer.Option(help="checkpoint file to write", dir_okay=False)],
-    share: Annotated[float, typer.Option(min=0, max=1, help="the second's part")] = 0.5,
+    share: Annotated[
+        float, typer.Option(min=-1, max=1, help="the second's part; below 0 beyond the first, away from the second")
+    ] = 0.5,
 ) -> None:
     """Mean of the weights of two checkpoints, one trained on from the other."""
     with _training_parts():

@@ -102,6 +102,11 @@ def test_the_mean_of_two_checkpoints_lies_between_them(textures: Path, tmp_path:
         if own.is_floating_point():
             torch.testing.assert_close(mean.modules[name], 0.75 * own + 0.25 * second.modules[name])
     mean.pair()
+    beyond, name = first.averaged(second, -0.25), "blur.head.weight"
+    torch.testing.assert_close(beyond.modules[name], 1.25 * first.modules[name] - 0.25 * second.modules[name])
+    calm = {name: v * (20 if name.endswith("running_var") else 1) for name, v in second.modules.items()}
+    with pytest.raises(ValueError, match="no variance"):
+        first.averaged(replace(second, modules=calm), -1.0)
     with pytest.raises(ValueError, match="no mean"):
         first.averaged(replace(second, config=replace(CONFIG, kind="paper")))
 
