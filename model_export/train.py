@@ -173,8 +173,8 @@ class Checkpoint:
         """This one with its weights moved by ``share`` towards those of a run that was trained on from it.
 
         Of two such runs the mean is often better than either (Izmailov et al. 2018). A share below 0 goes on past this
-        one, away from the other, as a longer run might have. Raises ``ValueError`` for networks of another kind, and
-        for a share that leaves a batch norm no variance.
+        one, away from the other, as a longer run might have; a batch norm's variance no further than to 0. Raises
+        ``ValueError`` for networks of another kind.
         """
         if other.config.kind != self.config.kind:
             raise ValueError(f"weights of a {self.config.kind} and a {other.config.kind} pair have no mean")
@@ -182,8 +182,9 @@ class Checkpoint:
             name: torch.lerp(own, other.modules[name], share) if own.is_floating_point() else own
             for name, own in self.modules.items()
         }
-        if any(name.endswith("running_var") and bool((own <= 0).any()) for name, own in modules.items()):
-            raise ValueError(f"a share of {share:g} goes too far: it leaves a batch norm no variance")
+        for name in modules:
+            if name.endswith("running_var"):
+                modules[name] = modules[name].clamp_min(0)
         return replace(self, modules=modules, step=self.step + other.step)
 
     def pair(self) -> Pair:
