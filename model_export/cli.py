@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Column, Table
 
+from model_export.config import Kind, TrainConfig
 from model_export.progress import progress_bar
 from service.config import INT8
 
@@ -20,7 +21,6 @@ commands = typer.Typer(help="Train, export and score models.")
 bench = typer.Typer(help="Measure speed, or accuracy where the truth is known.", invoke_without_command=True)
 commands.add_typer(bench, name="bench")
 
-Kind = Annotated[str, typer.Option(help="compact (ours) or paper")]
 Model = Annotated[Path, typer.Option(help="model folder", file_okay=False)]
 Textures = Annotated[Path, typer.Option(help="folder of pictures with LICENCES.md", exists=True, file_okay=False)]
 Frames = Annotated[
@@ -61,7 +61,7 @@ def train(
     run: Annotated[Path, typer.Option(help="folder of the run: its checkpoint lies there and is gone on from")],
     textures: Textures,
     frames: Frames = None,
-    kind: Kind = "compact",
+    kind: Annotated[Kind, typer.Option(help="ours or the paper's pair")] = "compact",
     steps: Annotated[int, typer.Option(min=1, help="batches in the whole run")] = 12_000,
     seed: Annotated[int, typer.Option(min=0, help="the same seed is the same run")] = 1,
     weights: Annotated[
@@ -86,14 +86,9 @@ def train(
 ) -> None:
     """Train a pair of networks on procedural scenes; stop and start it as you like."""
     with _training_parts():
-        from model_export.config import TrainConfig
         from model_export.train import train as run_training
 
-    if kind not in {"compact", "paper"}:
-        raise _fail(f"--kind is compact or paper, not {kind}")
-    plain = TrainConfig(
-        kind="paper" if kind == "paper" else "compact", seed=seed, steps=steps, learning_rate=learning_rate
-    )
+    plain = TrainConfig(kind=kind, seed=seed, steps=steps, learning_rate=learning_rate)
     try:
         path = run_training(
             plain.adjusted(setting or ()),

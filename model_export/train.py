@@ -170,7 +170,7 @@ class Checkpoint:
         return cls(config, content["step"], content["modules"], content.get("optimizers", []))
 
     def averaged(self, other: "Checkpoint", share: float = 0.5) -> "Checkpoint":
-        """This one with its weights moved by ``share`` towards those of a run that was trained on from it.
+        """This one with its weights moved by ``share`` towards another run's, one of them trained on from the other.
 
         Of two such runs the mean is often better than either (Izmailov et al. 2018). A share below 0 goes on past this
         one, away from the other, as a longer run might have; a batch norm's variance no further than to 0. Raises
@@ -182,9 +182,7 @@ class Checkpoint:
             name: torch.lerp(own, other.modules[name], share) if own.is_floating_point() else own
             for name, own in self.modules.items()
         }
-        for name in modules:
-            if name.endswith("running_var"):
-                modules[name] = modules[name].clamp_min(0)
+        modules |= {name: v.clamp_min(0) for name, v in modules.items() if name.endswith("running_var")}
         return replace(self, modules=modules, step=self.step + other.step)
 
     def pair(self) -> Pair:
