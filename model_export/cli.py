@@ -164,16 +164,16 @@ def export(
 ) -> None:
     """Write a checkpoint as a model folder, and in it one in int8: two ONNX graphs, card and manifest each."""
     with _training_parts():
+        from model_export.corrections import calibrate
         from model_export.export import export_checkpoint
         from model_export.quantized import quantised_graphs
-        from model_export.temperature import calibrate
 
     pictures = [folder for folder in (textures, frames) if folder is not None]
     manifest = export_checkpoint(checkpoint, pictures, out, name)
     export_checkpoint(checkpoint, pictures, out / INT8, f"{manifest.name}-{INT8}", quantised_graphs)
     for folder in (out, out / INT8):
-        calibrated = calibrate(folder)
-        typer.echo(f"{calibrated.name} in {folder}, stated errors times {calibrated.temperature:.2f}")
+        gain, temperature = calibrate(folder)
+        typer.echo(f"{folder}: blur times {gain:.3f}, stated errors times {temperature:.2f}")
 
 
 @commands.command()

@@ -57,7 +57,8 @@ class TrainConfig:
     """A training run: ``steps`` batches, drawn from a pool that ``fresh_per_step`` new scenes flow through.
 
     The last ``settled_share`` of the steps has the batch norms' statistics fixed, as the exported network has: all of
-    them in a run that begins with weights, decoders' too. A ``taught`` run learns teachers' answers too.
+    them in a run that begins with weights, decoders' too. A ``taught`` run learns teachers' answers too; one that is
+    ``depth_only`` leaves the blur network as it is.
     """
 
     kind: Kind = "compact"
@@ -72,6 +73,7 @@ class TrainConfig:
     b_weight: float = 1.0
     side_weight: float = 0.3
     taught: bool = False
+    depth_only: bool = False
     likeness_weight: float = 10.0
     pool: int = 600
     fresh_per_step: float = 1.0

@@ -19,7 +19,7 @@ SIZES = (0.65, 1.0)  # of the frame's own size
 CONTRASTS = (0.75, 1.3)  # power of the light
 TINTS = (0.8, 1.2)
 # rendered rooms are mostly looked at from near (1.2 m); photographs of rooms from where what is out of focus is behind
-FAR_LEAN = 1.5
+FAR_LEAN = 1.25
 Map = NDArray[np.float32]
 
 

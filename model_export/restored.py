@@ -1,5 +1,6 @@
 """A model folder back to networks that training goes on from: the way back of ``folded.py``."""
 
+import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -17,7 +18,7 @@ LEAST_LENGTH = 1e-6
 
 
 def restored(model: Path) -> Pair:
-    """The networks of a float32 model folder, in evaluation mode: the same answers to rounding.
+    """The networks of a float32 model folder, in evaluation mode: the same answers to rounding, ``blur_gain`` within.
 
     Its batch norms do nothing yet but add: ``spread_norms`` gives them their part. Raises ``ValueError`` for a folder
     whose graphs are not the folded form of the compact pair.
@@ -39,6 +40,9 @@ def restored(model: Path) -> Pair:
             norm.bias.copy_(other.convolutions()[-1].get_parameter("bias"))
     for head, shipped in zip(_heads(pair), _heads(whole), strict=True):
         head.load_state_dict(shipped.state_dict())
+    gain = load_model_folder(model).manifest.blur_gain
+    with torch.no_grad():
+        pair.blur.get_submodule("head").get_parameter("bias")[0] += math.log(gain)
     return pair
 
 

@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 import torch
 from rich.console import Console
+from torch import nn
 from torch.nn.utils import convert_conv2d_weight_memory_format
 from torch.utils.data import DataLoader, Dataset
 
@@ -242,6 +243,8 @@ class Trainer:
         self.pair = make_pair(config.kind, widths if resume is None else Widths.of(resume.modules))
         self.modules = self.pair.modules().to(self.device)
         convert_conv2d_weight_memory_format(self.modules, torch.channels_last)
+        self.pair.blur.requires_grad_(not config.depth_only)
+        self.learning: nn.Module = self.pair.depth if config.depth_only else self.modules
         self.optimizers = Optimizers(self.modules, config.weight_decay)
         self.teachers: list[Pair] = []
         self.step = 0
@@ -268,7 +271,8 @@ class Trainer:
 
     def advance(self, batch: Batch) -> dict[str, float]:
         """One optimiser step on a batch; the loss's parts."""
-        self.modules.train()
+        self.modules.eval()
+        self.learning.train()
         if self.step >= settling_step(self.config):
             for norm in self._norms():
                 norm.eval()
@@ -276,13 +280,13 @@ class Trainer:
             loss, parts = total_loss(self.pair, batch, self.config, self.teachers, emphasis(self.config, self.step))
         self.modules.zero_grad(set_to_none=True)
         torch.autograd.backward(loss)
-        torch.nn.utils.clip_grad_norm_(self.modules.parameters(), self.config.clip_norm)
+        nn.utils.clip_grad_norm_(self.modules.parameters(), self.config.clip_norm)
         self.optimizers.step(learning_rate(self.config, self.step))
         self.step += 1
         return {name: float(part) for name, part in parts.items()}
 
-    def _norms(self) -> list[torch.nn.BatchNorm2d]:
-        return [m for m in self.modules.modules() if isinstance(m, torch.nn.BatchNorm2d)]
+    def _norms(self) -> list[nn.BatchNorm2d]:
+        return [m for m in self.learning.modules() if isinstance(m, nn.BatchNorm2d)]
 
     def settle(self, batches: Iterable[Batch]) -> None:
         """Set every batch norm to the plain mean over batches, seen with the weights as they are now.
@@ -291,7 +295,7 @@ class Trainer:
         """
         norms = self._norms()
         momenta = [norm.momentum for norm in norms]
-        self.modules.train()
+        self.learning.train()
         for norm in norms:
             norm.reset_running_stats()
             norm.momentum = None

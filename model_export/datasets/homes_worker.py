@@ -19,8 +19,10 @@ from mathutils import Matrix, Vector
 
 SENSOR_MM = 36.0
 TRIES = 8
+GLIMPSES = (20, 15)
 NEAREST_M = 0.2
 EMPTY_SHARE = 0.005
+OVERVIEW_SHARE, OVERVIEW_M = 0.7, (2.0, 6.0)
 THING_M = 0.6  # what is smaller stands on tables
 OWN_PAINT_SHARE = 0.8
 PAINTED_WALLS = 0.75
@@ -225,28 +227,58 @@ def light(dice, size):
     bpy.context.scene.world = sky([level * dice.uniform(0.85, 1) for _ in range(3)])
 
 
-def stand(dice, scene, size, looks):
-    """Put the camera somewhere in the room and have it look at something."""
-    target, (near, far) = dice.choice(looks)
+def beside(dice, target, reach, size):
+    """A point of the room that is about so far from another; close ones are looked down upon."""
+    near, far = reach
     away = math.exp(dice.uniform(math.log(near), math.log(far)))
     low, turn = dice.uniform(0.05, 0.9) if far < 2 else dice.uniform(-0.15, 0.5), dice.uniform(0, 6.3)
     step = Vector((math.cos(turn) * math.cos(low), math.sin(turn) * math.cos(low), math.sin(low)))
-    eye = Vector(target) + away * step
+    eye = target + away * step
     half = [side / 2 - 0.1 for side in size[:2]]
-    eye = Vector((*(max(-h, min(h, v)) for h, v in zip(half, eye, strict=False)), max(0.2, min(size[2] - 0.2, eye.z))))
-    looked = Vector(target) + 0.15 * away * Vector([dice.gauss(0, 1) for _ in range(3)])
+    return Vector((*(max(-h, min(h, v)) for h, v in zip(half, eye, strict=False)), max(0.2, min(size[2] - 0.2, eye.z))))
+
+
+def stand(dice, scene, size, looks):
+    """Put the camera somewhere in the room and have it look at something, at times from as far as the room allows."""
+    target, reach = dice.choice(looks)
+    target = Vector(target)
+    if dice.random() < OVERVIEW_SHARE:
+        eye = max((beside(dice, target, OVERVIEW_M, size) for _ in range(TRIES)), key=lambda at: (at - target).length)
+    else:
+        eye = beside(dice, target, reach, size)
+    away = (eye - target).length
+    looked = target + 0.15 * away * Vector([dice.gauss(0, 1) for _ in range(3)])
     scene.camera.location = eye
     roll = Matrix.Rotation(dice.gauss(0, 0.05), 4, "Z")
     scene.camera.rotation_euler = ((looked - eye).to_track_quat("-Z", "Y").to_matrix().to_4x4() @ roll).to_euler()
     scene.camera.data.lens = SENSOR_MM * math.exp(dice.uniform(math.log(0.65), math.log(1.6)))
 
 
+def glimpse(scene):
+    """Depths at a few points of the view, 0 where nothing is: a hundredth of what rendering them takes."""
+    bpy.context.view_layer.update()
+    graph, place = bpy.context.evaluated_depsgraph_get(), scene.camera.matrix_world
+    right, low, _, high = scene.camera.data.view_frame(scene=scene)
+    depths = []
+    for row in np.linspace(0.03, 0.97, GLIMPSES[1]).tolist():
+        for column in np.linspace(0.03, 0.97, GLIMPSES[0]).tolist():
+            ray = high + column * (right - high) + row * (low - right)
+            towards = place.to_3x3() @ ray
+            hit, at, *_ = scene.ray_cast(graph, place.translation, towards)
+            depths.append(-(place.inverted() @ at).z if hit else 0.0)
+    return np.array(depths)
+
+
+def is_clear(depth_m):
+    """Whether there is something everywhere, and nothing right before the lens."""
+    return (depth_m <= 0).mean() < EMPTY_SHARE and np.quantile(depth_m, 0.02) > NEAREST_M
+
+
 def seen(dice, scene, size, looks):
     """Depth [h,w] of a view with nothing right before the lens; None if none was found."""
     for _ in range(TRIES):
         stand(dice, scene, size, looks)
-        depth_m = depth_of(scene)
-        if (depth_m <= 0).mean() < EMPTY_SHARE and np.quantile(depth_m, 0.02) > NEAREST_M:
+        if is_clear(glimpse(scene)) and is_clear(depth_m := depth_of(scene)):
             return depth_m
     return None
 
@@ -267,7 +299,7 @@ def main():
             }
         )
         scene.render.resolution_y = room["height_px"]
-        scene.cycles.max_bounces = 2
+        scene.cycles.max_bounces, scene.cycles.use_light_tree = 2, False
         scene.cycles.use_denoising, scene.cycles.denoising_quality = True, "FAST"
         scene.cycles.denoiser, scene.cycles.denoising_prefilter = "OPENIMAGEDENOISE", "NONE"
         scene.render.use_persistent_data = True

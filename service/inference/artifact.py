@@ -145,8 +145,9 @@ class Manifest(_Part):
     """What ``manifest.json`` says.
 
     ``multiple``: height and width of the image given to the blur graph are multiples of it.
-    ``stride``: pixels of the image per pixel of the maps, along each axis. ``temperature``: what stated errors of depth
-    are multiplied with, so that they hold what they promise for cameras that were not trained on.
+    ``stride``: pixels of the image per pixel of the maps, along each axis. ``blur_gain``: what lambda as the blur graph
+    answers it is multiplied with, so that it is neither too high nor too low on the whole. ``temperature``: what stated
+    errors of depth are multiplied with, so that they hold what they promise for cameras that were not trained on.
     """
 
     schema_version: Literal[1] = SCHEMA_VERSION
@@ -155,6 +156,7 @@ class Manifest(_Part):
     created_at: AwareDatetime
     multiple: Annotated[int, Field(ge=1, le=256)]
     stride: Annotated[int, Field(ge=1, le=16)]
+    blur_gain: Annotated[float, Field(gt=0, le=10)] = 1.0
     temperature: Annotated[float, Field(gt=0, le=10)] = 1.0
     graphs: Graphs
     ranges: Ranges

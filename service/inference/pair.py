@@ -86,7 +86,8 @@ class GraphPair:
 
     def see(self, rgb: NDArray[np.uint8], cancellation: Cancellation) -> RawMaps:
         """What the blur graph says of an image: the same for every camera."""
-        return self._blur.run({"image": self._padded(rgb)}, cancellation)
+        seen = self._blur.run({"image": self._padded(rgb)}, cancellation)
+        return seen | {"blur_px": seen["blur_px"] * np.float32(self.manifest.blur_gain)}
 
     def _padded(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
         """float32 [1, 3, h, w] in 0..1, mirrored at the right and bottom up to the next multiple."""

@@ -57,6 +57,15 @@ def test_sigma_is_root_two_times_the_laplace_scale_times_depth(estimator: Estima
     np.testing.assert_allclose(answer.sigma_m, np.sqrt(2) * LOG_DEPTH_SCALE * answer.depth_m, rtol=1e-4)
 
 
+def test_blur_is_multiplied_by_the_models_gain(folder: Path) -> None:
+    model = load_model_folder(folder)
+    lower = replace(model, manifest=model.manifest.model_copy(update={"blur_gain": 0.9}))
+    answer = Estimator.from_folder(lower).estimate(grey(80), CAMERA, "near")
+    x = thin_lens.relative_defocus_from_blur(0.9 * blur_of(80), CAMERA.gamma_px, CAMERA.k_cam_px)
+    np.testing.assert_allclose(answer.blur_px, 0.9 * blur_of(80), rtol=1e-4)
+    np.testing.assert_allclose(answer.depth_m, thin_lens.depth_near(x, CAMERA.focus_distance_m), rtol=1e-4)
+
+
 def test_sigma_is_multiplied_by_the_models_temperature(folder: Path) -> None:
     model = load_model_folder(folder)
     warm = replace(model, manifest=model.manifest.model_copy(update={"temperature": 1.5}))

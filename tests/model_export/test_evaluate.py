@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from model_export.cases import REFERENCE, Case, Trial, d200_cases, procedural_cases, shuffled_cases, viewed_cases
 from model_export.cli import commands
+from model_export.corrections import blur_gain, calibrate, temperature
 from model_export.evaluate import (
     EQUAL_BLUR_PX,
     RIGHT_SIDE,
@@ -23,7 +24,6 @@ from model_export.evaluate import (
     evaluate,
     summarise,
 )
-from model_export.temperature import calibrate, temperature
 from service.inference.artifact import Interval, load_model_folder
 from service.optics import thin_lens
 from service.optics.camera import Camera
@@ -175,6 +175,12 @@ def test_the_temperature_makes_intervals_hold_what_they_promise() -> None:
     assert temperature(pixels) == pytest.approx(2.5, rel=0.05)
 
 
+def test_the_gain_makes_blur_right_in_the_median_where_it_is_well_read() -> None:
+    truth = np.array([0.5, 2, 4, 7.9, 16], np.float32)
+    answer = truth * np.array([3, 1.25, 1.25, 1.0, 0.1], np.float32)
+    assert blur_gain(Pixels(truth, answer, np.ones_like(truth))) == pytest.approx(0.8)
+
+
 def _told(found: float, _: Pixels) -> float:
     return found
 
@@ -184,10 +190,12 @@ def test_stated_errors_are_made_larger_by_what_is_found_but_never_smaller(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, found: float, factor: float
 ) -> None:
     folder = build_oracle_pair(tmp_path / "model")
-    monkeypatch.setattr("model_export.temperature.SCENES", 1)
-    monkeypatch.setattr("model_export.temperature.temperature", partial(_told, found))
-    assert calibrate(folder).temperature == factor
-    assert load_model_folder(folder).manifest.temperature == factor
+    monkeypatch.setattr("model_export.corrections.SCENES", 1)
+    monkeypatch.setattr("model_export.corrections.blur_gain", partial(_told, 0.9))
+    monkeypatch.setattr("model_export.corrections.temperature", partial(_told, found))
+    assert calibrate(folder) == (0.9, factor)
+    manifest = load_model_folder(folder).manifest
+    assert (manifest.blur_gain, manifest.temperature) == (0.9, factor)
 
 
 @pytest.mark.parametrize(("factor", "right", "either"), [(1.0, 0, 1), (1.05, 0, 1), (0.7, 0, 0)])

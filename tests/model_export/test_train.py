@@ -197,6 +197,15 @@ def test_a_stopped_run_goes_on_as_if_it_had_not_been_stopped(textures: Path, tmp
         torch.testing.assert_close(resumed.modules[name], weight, msg=name)
 
 
+def test_a_run_of_depth_only_leaves_the_blur_network_as_it_is(textures: Path, tmp_path: Path) -> None:
+    first, _ = run(CONFIG, textures, tmp_path / "first")
+    config = replace(CONFIG, depth_only=True)
+    path = train(config, textures, tmp_path / "next", weights=tmp_path / "first" / "checkpoint.pt", workers=0)
+    after = Checkpoint.load(path)
+    moved = {name.split(".")[0] for name, own in first.modules.items() if not torch.equal(own, after.modules[name])}
+    assert moved == {"depth"}
+
+
 def test_statistics_follow_the_batches_until_they_are_settled() -> None:
     batch = collate([draw_sample(seed, SCENES) for seed in range(2)], np.random.default_rng(0))
     trainer = Trainer(CONFIG, "cpu")
