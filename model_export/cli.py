@@ -169,11 +169,16 @@ def export(
         from model_export.quantized import quantised_graphs
 
     pictures = [folder for folder in (textures, frames) if folder is not None]
-    manifest = export_checkpoint(checkpoint, pictures, out, name)
-    export_checkpoint(checkpoint, pictures, out / INT8, f"{manifest.name}-{INT8}", quantised_graphs)
-    for folder in (out, out / INT8):
-        gain, temperature = calibrate(folder)
-        typer.echo(f"{folder}: blur times {gain:.3f}, stated errors times {temperature:.2f}")
+    with progress_bar(Console(stderr=True)) as progress:
+        task = progress.add_task("float32", total=4)
+        manifest = export_checkpoint(checkpoint, pictures, out, name)
+        progress.update(task, advance=1, description=INT8)
+        export_checkpoint(checkpoint, pictures, out / INT8, f"{manifest.name}-{INT8}", quantised_graphs)
+        progress.update(task, advance=1, description="held-out scenes")
+        for folder in (out, out / INT8):
+            gain, temperature = calibrate(folder)
+            progress.advance(task)
+            typer.echo(f"{folder}: blur times {gain:.3f}, stated errors times {temperature:.2f}")
 
 
 @commands.command()

@@ -48,7 +48,7 @@ def calibrate(model: Path) -> tuple[float, float]:
 
 def _told(model: Path, name: str, factor: float, at_least: float = 0.0) -> float:
     """Multiply a number of a folder's manifest, which answers were made with, by what they lack; what it is now."""
-    before = load_model_folder(model).manifest.model_dump()
-    now = round(max(at_least, before[name] * factor), DECIMALS)
-    write_manifest(model, Manifest.model_validate(before | {name: now}))
+    before = load_model_folder(model).manifest
+    now = round(max(at_least, float(getattr(before, name)) * factor), DECIMALS)
+    write_manifest(model, Manifest.model_validate(before.model_dump() | {name: now}))
     return now

@@ -34,11 +34,11 @@ def test_a_view_shows_what_it_says_the_depth_of(size: int) -> None:
 
 
 def test_frames_that_look_far_are_drawn_more_often() -> None:
-    """One that looks four times as far eight times as often."""
-    near, far = frame(0.5, 0.5), frame(2.0, 2.0)
+    """One that looks sixteen times as far 32 times as often."""
+    near, far = frame(0.25, 0.25), frame(4.0, 4.0)
     rng = np.random.default_rng(0)
     share = np.mean([draw_frame(rng, [near, far]) is far for _ in range(2000)])
-    assert share == pytest.approx(8 / 9, abs=0.025)
+    assert share == pytest.approx(32 / 33, abs=0.012)
 
 
 def test_frames_are_half_of_the_scenes_and_keep_their_metres() -> None:
