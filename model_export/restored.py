@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from model_export.folded import folded
 from model_export.networks import Normed, Pair, Widths, batch_norm, make_pair, norm_gain
-from service.inference.artifact import load_model_folder
+from service.inference.artifact import ModelFolder, load_model_folder
 
 PREFIX = "network."
 LEAST_LENGTH = 1e-6
@@ -23,7 +23,8 @@ def restored(model: Path) -> Pair:
     Its batch norms do nothing yet but add: ``spread_norms`` gives them their part. Raises ``ValueError`` for a folder
     whose graphs are not the folded form of the compact pair.
     """
-    weights = _weights(model)
+    folder = load_model_folder(model)
+    weights = _weights(folder)
     try:
         pair = make_pair("compact", Widths.of(weights))
         pair.modules().eval()
@@ -40,19 +41,18 @@ def restored(model: Path) -> Pair:
             norm.bias.copy_(other.convolutions()[-1].get_parameter("bias"))
     for head, shipped in zip(_heads(pair), _heads(whole), strict=True):
         head.load_state_dict(shipped.state_dict())
-    gain = load_model_folder(model).manifest.blur_gain
     with torch.no_grad():
-        pair.blur.get_submodule("head").get_parameter("bias")[0] += math.log(gain)
+        pair.blur.get_submodule("head").get_parameter("bias")[0] += math.log(folder.manifest.blur_gain)
     return pair
 
 
-def _weights(model: Path) -> dict[str, Tensor]:
+def _weights(folder: ModelFolder) -> dict[str, Tensor]:
     """What the graphs of a folder hold, by the names of ``Pair.modules()``."""
-    graphs = load_model_folder(model).manifest.graphs
+    graphs = folder.manifest.graphs
     return {
         f"{network}.{tensor.name.removeprefix(PREFIX)}": torch.from_numpy(numpy_helper.to_array(tensor).copy())
         for network, graph in (("blur", graphs.blur), ("depth", graphs.depth))
-        for tensor in onnx.load(model / graph.file).graph.initializer
+        for tensor in onnx.load(folder.path / graph.file).graph.initializer
         if tensor.name.startswith(PREFIX)
     }
 

@@ -258,14 +258,14 @@ def glimpse(scene):
     """Depths at a few points of the view, 0 where nothing is: a hundredth of what rendering them takes."""
     bpy.context.view_layer.update()
     graph, place = bpy.context.evaluated_depsgraph_get(), scene.camera.matrix_world
+    turned, back = place.to_3x3(), place.inverted()
     right, low, _, high = scene.camera.data.view_frame(scene=scene)
     depths = []
     for row in np.linspace(0.03, 0.97, GLIMPSES[1]).tolist():
         for column in np.linspace(0.03, 0.97, GLIMPSES[0]).tolist():
             ray = high + column * (right - high) + row * (low - right)
-            towards = place.to_3x3() @ ray
-            hit, at, *_ = scene.ray_cast(graph, place.translation, towards)
-            depths.append(-(place.inverted() @ at).z if hit else 0.0)
+            hit, at, *_ = scene.ray_cast(graph, place.translation, turned @ ray)
+            depths.append(-(back @ at).z if hit else 0.0)
     return np.array(depths)
 
 
