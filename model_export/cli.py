@@ -82,6 +82,14 @@ def train(
         typer.Option(help="anything else of the run: decay_share=0.8, scenes.frame_share=0.5, scenes.k_cam_px=[1,20]"),
     ] = None,
     workers: Annotated[int, typer.Option(min=0, max=64, help="processes that draw scenes")] = 1,
+    threads: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="cores that torch computes on, shared with the workers or not",
+            show_default="those that workers leave",
+        ),
+    ] = None,
     device: Annotated[str, typer.Option(help="torch device")] = "cpu",
 ) -> None:
     """Train a pair of networks on procedural scenes; stop and start it as you like."""
@@ -99,6 +107,7 @@ def train(
             fresh_decoders=fresh_decoders,
             teachers=teacher or (),
             workers=workers,
+            threads=threads,
             device=device,
         )
     except (FileNotFoundError, ValueError) as exc:
@@ -207,36 +216,49 @@ def evaluate(
         Path, typer.Option(help="folder with rgbd/, tabletop/, d200/, blender/ (what is there is used)", exists=True)
     ],
     model: Model = DEFAULT_MODEL,
+    beside: Annotated[
+        Path | None, typer.Option(help="another model folder, to be compared on the same pictures", file_okay=False)
+    ] = None,
     quick: Annotated[bool, typer.Option(help="a few pictures of each set")] = False,
-    out: Annotated[Path | None, typer.Option(help="folder for report.html, report.json and their pictures")] = None,
-    update_card: Annotated[bool, typer.Option(help="write the scores into the model's card and manifest")] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="folder for report.html, report.json and their pictures; beside/ has the other's"),
+    ] = None,
+    update_card: Annotated[bool, typer.Option(help="write the scores into cards and manifests")] = False,
 ) -> None:
     """Score a model on pictures that no training saw, beside the best constant depth of each picture."""
     with _training_parts():
         from model_export import report as reports
+        from model_export.card import record_scores
         from model_export.cases import trials
         from model_export.evaluate import evaluate as run_evaluation
 
     sets = trials(data, quick)
+    models = [model] if beside is None else [model, beside]
     with progress_bar(Console(stderr=True)) as progress:
         task = progress.add_task("loading", total=len(sets))
-        report = run_evaluation(
-            model, sets, lambda said, finished: progress.update(task, description=said, advance=finished)
+        found = run_evaluation(
+            models, sets, lambda said, finished: progress.update(task, description=said, advance=finished)
         )
-    tables = []
-    for title, (head, rows) in reports.tables(report).items():
-        tables.append(Table(Column(head[0], no_wrap=True), *head[1:], title=title))
-        for row in rows:
-            tables[-1].add_row(*row)
-    _print(tables)
+    tables = reports.tables(found[0])
+    if beside is not None:
+        tables |= {f"{found[1].model} beside {found[0].model}": reports.beside(*found)}
+    _print([_as_table(title, head, rows) for title, (head, rows) in tables.items()])
     if out is not None:
-        reports.write(report, out)
+        for report, folder in zip(found, (out, out / "beside"), strict=False):
+            reports.write(report, folder)
         typer.echo(out / "report.html")
     if update_card:
-        from model_export.card import record_scores
-
         command = "camind evaluate --data DATA" + " --quick" * quick
-        record_scores(model, report.scores(), reports.markdown(report), command)
+        for report, folder in zip(found, models, strict=True):
+            record_scores(folder, report.scores(), reports.markdown(report), command)
+
+
+def _as_table(title: str, head: list[str], rows: list[list[str]]) -> Table:
+    table = Table(Column(head[0], no_wrap=True), *head[1:], title=title)
+    for row in rows:
+        table.add_row(*row)
+    return table
 
 
 @bench.callback()

@@ -7,7 +7,7 @@ without an answer is scored with the median of the picture's answers, and the sh
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -427,46 +427,63 @@ def blur_ranges(name: str, pixels: Pixels) -> list[BlurRange]:
     return found
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Examined:
-    """A trial's outcomes by mode, and its first picture."""
+    """One model's outcomes of a trial by mode, and its first picture."""
 
     name: str
-    outcomes: dict[str, list[Outcome]]
-    example: Example | None
+    outcomes: dict[str, list[Outcome]] = field(default_factory=dict)
+    searched: dict[float, list[Outcome]] = field(default_factory=dict)
+    example: Example | None = None
 
-
-def _examined(model: Path, on_progress: Callable[[str, int], None], trial: Trial) -> _Examined:
-    examiner = Examiner(model)
-    outcomes: dict[str, list[Outcome]] = {}
-    searched: dict[float, list[Outcome]] = {}
-    first: Example | None = None
-    for case in trial.cases():
+    def take(self, examiner: Examiner, case: Case, trial: Trial) -> None:
+        """Have the model answer one more picture, in all modes of the trial."""
         for mode in trial.modes:
             outcome, example = examiner.answer(case, mode)
-            outcomes.setdefault(mode, []).append(outcome)
-            first = first or example
+            self.outcomes.setdefault(mode, []).append(outcome)
+            self.example = self.example or example
         for factor in ORACLE_FACTORS if trial.oracle else ():
-            searched.setdefault(factor, []).append(examiner.told(case, factor * case.camera.k_cam_px)[0])
+            self.searched.setdefault(factor, []).append(examiner.told(case, factor * case.camera.k_cam_px)[0])
+
+    def by_mode(self) -> dict[str, list[Outcome]]:
+        """All outcomes, of the factors on k_cam the best one's."""
+        if not self.searched:
+            return self.outcomes
+        best = min(self.searched, key=lambda factor: mean_scores([o.scores for o in self.searched[factor]]).abs_rel)
+        return self.outcomes | {f"{ORACLE_K_CAM}, x {best:g}": self.searched[best]}
+
+
+def _examined(models: Sequence[Path], on_progress: Callable[[str, int], None], trial: Trial) -> list[_Examined]:
+    examiners = [Examiner(model) for model in models]
+    found = [_Examined(trial.name) for _ in models]
+    for case in trial.cases():
+        for examiner, examined in zip(examiners, found, strict=True):
+            examined.take(examiner, case, trial)
         on_progress(f"{trial.name}: {case.name}", 0)
-    if searched:
-        best = min(searched, key=lambda factor: mean_scores([o.scores for o in searched[factor]]).abs_rel)
-        outcomes[f"{ORACLE_K_CAM}, x {best:g}"] = searched[best]
     on_progress(trial.name, 1)
-    return _Examined(trial.name, outcomes, first)
+    return found
 
 
 def evaluate(
-    model: Path, trials: Sequence[Trial], on_progress: Callable[[str, int], None] = lambda _said, _finished: None
-) -> Report:
-    """Score a model folder on sets of pictures, two sets at a time.
+    models: Sequence[Path],
+    trials: Sequence[Trial],
+    on_progress: Callable[[str, int], None] = lambda _said, _finished: None,
+) -> list[Report]:
+    """Score model folders on the same sets of pictures, two sets at a time; a report of each.
 
     ``on_progress`` hears, from any thread, of every picture, and how many sets that finishes.
     """
     # renderings side by side, rather than each in pieces on every core
     with torch_threads(1), ThreadPoolExecutor(SETS_AT_ONCE) as pool:
-        done = list(pool.map(partial(_examined, model, on_progress), trials))
-    outcomes = {(e.name, mode): scored for e in done for mode, scored in e.outcomes.items()}
+        done = list(pool.map(partial(_examined, models, on_progress), trials))
+    return [
+        _reported(load_model_folder(model).manifest.name, [of_set[number] for of_set in done])
+        for number, model in enumerate(models)
+    ]
+
+
+def _reported(model: str, done: Sequence[_Examined]) -> Report:
+    outcomes = {(e.name, mode): scored for e in done for mode, scored in e.by_mode().items()}
     examples = {e.name: e.example for e in done if e.example is not None}
     for k_cam_px in UNSEEN_K_CAM_PX:
         for mode in MODES:
@@ -478,7 +495,7 @@ def evaluate(
         blur.setdefault(name.split()[0], []).extend(o.blur for o in found if o.blur is not None)
     blur_pixels = {name: Pixels.joined(parts) for name, parts in blur.items() if parts}
     return Report(
-        model=load_model_folder(model).manifest.name,
+        model=model,
         sets=[summarise(name, mode, found) for (name, mode), found in outcomes.items()],
         blur=[row for name, pixels in blur_pixels.items() for row in blur_ranges(name, pixels)],
         blur_pixels=blur_pixels,

@@ -4,10 +4,58 @@ Muon (Jordan et al. 2024) makes a step of momentum even in all directions of a f
 learned too. Its steps are scaled to AdamW's (Liu et al. 2025), so one learning rate serves both.
 """
 
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+
+MOMENTUM = 0.95
+NEWTON_SCHULZ = (3.4445, -4.775, 2.0315)  # Jordan et al.: the steepest at zero that does not run away
+NEWTON_SCHULZ_STEPS = 5
+RMS_OF_ADAMW = 0.2
+
+
+def computes_bfloat16(device: torch.device) -> bool:
+    """Whether the device multiplies bfloat16 itself."""
+    return device.type != "cpu" or torch.cpu._is_avx512_bf16_supported()
+
+
+def evened(matrix: Tensor, dtype: torch.dtype) -> Tensor:
+    """The matrix [m,n] with its singular values brought near 1, by products in ``dtype``."""
+    a, b, c = NEWTON_SCHULZ
+    tall = matrix.shape[0] > matrix.shape[1]
+    x = (matrix.T if tall else matrix).to(dtype)
+    x = x / x.norm().clamp(min=1e-7)
+    for _ in range(NEWTON_SCHULZ_STEPS):
+        gram = x @ x.T
+        x = torch.addmm(x, torch.addmm(gram, gram, gram, beta=b, alpha=c), x, beta=a)
+    return x.T if tall else x
+
+
+class Muon(torch.optim.Optimizer):
+    """``torch.optim.Muon``, but that its products are in bfloat16 only where that is computed, not emulated."""
+
+    def __init__(self, matrices: Iterable[Tensor], weight_decay: float) -> None:
+        super().__init__(matrices, {"lr": 1e-3, "weight_decay": weight_decay})
+
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:
+        """Move the matrices by their gradients; what ``closure`` gives, if there is one."""
+        loss = None if closure is None else closure()
+        with torch.no_grad():
+            for group in self.param_groups:
+                for matrix in group["params"]:
+                    if matrix.grad is not None:
+                        self._move(matrix, matrix.grad, group["lr"], group["weight_decay"])
+        return loss
+
+    def _move(self, matrix: Tensor, gradient: Tensor, rate: float, decay: float) -> None:
+        momentum = self.state[matrix].setdefault("momentum_buffer", torch.zeros_like(matrix))
+        momentum.lerp_(gradient, 1 - MOMENTUM)
+        dtype = torch.bfloat16 if computes_bfloat16(matrix.device) else torch.float32
+        matrix.mul_(1 - rate * decay)
+        step = RMS_OF_ADAMW * max(matrix.shape) ** 0.5 * rate
+        matrix.add_(evened(gradient.lerp(momentum, MOMENTUM), dtype), alpha=-step)
 
 
 def _as_matrix(filters: Tensor) -> Tensor:
@@ -25,7 +73,7 @@ class Optimizers:
         kept = {id(filters) for filters in self.filters}
         others = [p for p in modules.parameters() if id(p) not in kept]
         self.both: tuple[torch.optim.Optimizer, ...] = (
-            torch.optim.Muon(self.matrices, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw"),
+            Muon(self.matrices, weight_decay),
             torch.optim.AdamW(others, weight_decay=weight_decay),
         )
 

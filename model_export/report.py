@@ -45,6 +45,7 @@ EQUAL_HEAD = [
 ]
 RELIEF_HEAD = ["set", "camera", "true spread of ln z", "of it answered", "correlation"]
 SCORES_HEAD = ["set", "camera", "over", "AbsRel", "MSE", "RMSE", "log10", "delta1", "delta2", "delta3"]
+BESIDE_HEAD = ["set", "AbsRel", "of the other", "times", "pooled RMSE", "of the other", "times"]
 BLUR_HEAD = ["scenes", "lambda px", "pixels", "median error", "certain half", "90th percentile", "bias", "order"]
 NOMINAL = np.linspace(0.05, 0.95, 19)
 BINS = 16
@@ -98,6 +99,23 @@ def tables(report: Report) -> dict[str, Table]:
         "All scores of depth": (SCORES_HEAD, [row for s in report.sets for row in _score_rows(s)]),
         "Blur": (BLUR_HEAD, [_blur_row(b) for b in report.blur]),
     }
+
+
+def beside(report: Report, other: Report) -> Table:
+    """How another model answers the same pictures by known cameras: head and rows, the last of the worst ratios."""
+    rows, ratios = [], []
+    for s in report.sets:
+        if s.mode == "gt":
+            t = other.summary(s.name)
+            pairs = (s.mean.abs_rel, t.mean.abs_rel), (s.pooled.rmse, t.pooled.rmse)
+            ratios.append([its / own if own else math.nan for own, its in pairs])
+            texts = (
+                (f"{own:.3f}", f"{its:.3f}", f"{ratio:.3f}")
+                for (own, its), ratio in zip(pairs, ratios[-1], strict=True)
+            )
+            rows.append([s.name, *(text for pair in texts for text in pair)])
+    worst = [f"{ratio:.3f}" for ratio in np.nanmax(ratios, axis=0)]
+    return BESIDE_HEAD, [*rows, ["worst", "", "", worst[0], "", "", worst[1]]]
 
 
 def markdown(report: Report) -> dict[str, str]:

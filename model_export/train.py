@@ -29,7 +29,7 @@ from model_export.folded import folded
 from model_export.frames import load_frames
 from model_export.losses import Batch, run_pair, total_loss
 from model_export.networks import SHIPPED_WIDTHS, Pair, Widths, make_pair, with_fresh_decoders
-from model_export.optimizers import Optimizers
+from model_export.optimizers import Optimizers, computes_bfloat16
 from model_export.progress import progress_bar
 from model_export.restored import restored, spread_norms
 from model_export.scenes import Material, Sample, draw_sample
@@ -62,7 +62,7 @@ class SceneStream(Dataset[Sample]):
 def _worker_start(_: int) -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    os.nice(5)
+    os.nice(19)  # steps come first where cores are shared
 
 
 def scene_stream(config: TrainConfig, material: Material, start: int, end: int, workers: int) -> Iterator[Sample]:
@@ -223,11 +223,6 @@ def settling_step(config: TrainConfig) -> int:
     return round(config.steps * (1 - config.settled_share))
 
 
-def computes_bfloat16(device: torch.device) -> bool:
-    """Whether the device multiplies bfloat16 itself."""
-    return device.type != "cpu" or torch.cpu._is_avx512_bf16_supported()
-
-
 class Trainer:
     """Networks, optimiser and step of one run on one device."""
 
@@ -345,6 +340,7 @@ def train(
     fresh_decoders: bool = False,
     teachers: Sequence[Path] = (),
     workers: int = 1,
+    threads: int | None = None,
     device: str = "cpu",
     console: Console | None = None,
 ) -> Path:
@@ -352,8 +348,8 @@ def train(
 
     A run without a checkpoint begins with the ``weights`` of a checkpoint or a model folder, or with random ones; with
     ``fresh_decoders`` only with those of the encoders. ``teachers``, checkpoints or folders too, are those whose
-    answers, on average, are learned beside the truth. Torch computes on the cores that ``workers`` leave, so other
-    workers are another run by rounding.
+    answers, on average, are learned beside the truth. Torch computes on so many ``threads``, by itself on the cores
+    that ``workers`` leave; other threads are another run by rounding.
     Raises ``ValueError`` for weights of another kind, and for a run with teachers that is gone on with without.
     """
     console = console or Console(stderr=True)
@@ -364,9 +360,7 @@ def train(
     config = trainer.config
     pool = Pool(config, material, trainer.step, workers)
     test = held_out(config.scenes, material, 2 * config.batch)
-    # two busy processes on one core cost each far more than half its speed
-    threads = max(1, available_cores() - workers)
-    with torch_threads(threads), progress_bar(console) as progress:
+    with torch_threads(threads or max(1, available_cores() - workers)), progress_bar(console) as progress:
         for _ in progress.track(pool.fill(), total=config.pool, description="scenes"):
             pass
         if start is not None and weights is not None:

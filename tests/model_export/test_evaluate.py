@@ -1,6 +1,7 @@
 """Evaluation, with a pair whose answers are known."""
 
 import json
+import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,7 +25,8 @@ from model_export.evaluate import (
     evaluate,
     summarise,
 )
-from service.inference.artifact import Interval, load_model_folder
+from model_export.report import beside
+from service.inference.artifact import Interval, load_model_folder, write_manifest
 from service.optics import thin_lens
 from service.optics.camera import Camera
 from tests.inference.oracle_pair import LOG_DEPTH_SCALE, RELATIVE_BLUR_ERROR, blur_of, build_oracle_pair
@@ -98,9 +100,24 @@ def test_the_right_side_is_that_of_each_pixel(oracle: Examiner) -> None:
 def test_the_oracle_finds_the_one_factor_that_all_pictures_like_best(tiny_model_dir: Path) -> None:
     wrong = replace(CAMERA, k_cam_px=CAMERA.k_cam_px / 1.25)
     pictures = [replace(case(1.0), camera=wrong) for _ in range(2)]
-    report = evaluate(tiny_model_dir, [Trial("grey", lambda: iter(pictures), oracle=True)])
+    (report,) = evaluate([tiny_model_dir], [Trial("grey", lambda: iter(pictures), oracle=True)])
     assert report.summary("grey").mean.abs_rel > 0.05
     assert report.summary("grey", "oracle k_cam, x 1.25").mean.abs_rel == pytest.approx(0, abs=1e-3)
+
+
+def test_two_models_are_compared_on_the_same_pictures(tiny_model_dir: Path, tmp_path: Path) -> None:
+    """One answers a picture 0.25 too far; the other, whose blur is a tenth less, 0.25 and a bit more."""
+    other = tmp_path / "other"
+    shutil.copytree(tiny_model_dir, other)
+    write_manifest(other, load_model_folder(other).manifest.model_copy(update={"blur_gain": 0.9}))
+    pictures = [case(0.8)]
+    both = evaluate([tiny_model_dir, other], [Trial("grey", lambda: iter(pictures))])
+    own, others = (report.summary("grey").mean.abs_rel for report in both)
+    assert own == pytest.approx(0.25, abs=1e-3)
+    assert others > own + 0.02
+    head, (row, worst) = beside(*both)
+    assert row[:4] == ["grey", f"{own:.3f}", f"{others:.3f}", f"{others / own:.3f}"]
+    assert worst[head.index("times")] == row[3]
 
 
 def test_certainty_and_blur_are_scored_where_they_are_known(oracle: Examiner) -> None:
@@ -278,11 +295,13 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_command_prints_and_writes_what_it_found(data: Path, tiny_model_dir: Path, tmp_path: Path) -> None:
     out = tmp_path / "report"
-    arguments = ["--data", data, "--model", tiny_model_dir, "--quick", "--out", out]
+    models = ["--model", tiny_model_dir, "--beside", tiny_model_dir]
+    arguments = ["--data", data, *models, "--quick", "--out", out]
     result = CliRunner().invoke(commands, ["evaluate", *map(str, arguments)])
     assert result.exit_code == 0, result.output
-    for said in ("rgbd k_cam 3.81", "k_cam -10%", "tabletop shuffled", "procedural mixed", "report.html"):
+    for said in ("rgbd k_cam 3.81", "k_cam -10%", "tabletop shuffled", "procedural mixed", "worst", "report.html"):
         assert said in result.output
+    assert json.loads((out / "beside" / "report.json").read_text()) == json.loads((out / "report.json").read_text())
     report = json.loads((out / "report.json").read_text())
     sets = {(s["name"], s["mode"]): s for s in report["sets"]}
     assert sets["indoor k_cam 3.81", "gt"]["pictures"] == 2

@@ -1,11 +1,12 @@
 """The optimisers: every weight moves, filters in all directions alike."""
 
+import pytest
 import torch
 from torch import nn
 from torch.nn.utils import convert_conv2d_weight_memory_format
 
 from model_export.networks import make_pair
-from model_export.optimizers import Optimizers
+from model_export.optimizers import Muon, Optimizers
 
 
 def test_a_step_moves_every_weight_that_has_a_gradient() -> None:
@@ -37,3 +38,28 @@ def test_a_step_of_filters_is_even_in_all_directions() -> None:
     assert moved[0] / moved[-1] < 2
     # as large as a step of AdamW mostly is: a fifth of the learning rate
     assert 0.1 * 1e-2 < step.square().mean().sqrt() < 0.4 * 1e-2
+
+
+@pytest.mark.parametrize("shape", [(8, 144), (144, 8)])
+def test_muon_is_that_of_torch_whose_products_are_in_bfloat16(shape: tuple[int, int]) -> None:
+    torch.manual_seed(0)
+    ours, torchs = (start := torch.randn(shape)).clone(), start.clone()
+    both: tuple[torch.optim.Optimizer, ...] = (
+        Muon([ours], weight_decay=0.1),
+        torch.optim.Muon([torchs], weight_decay=0.1, adjust_lr_fn="match_rms_adamw"),
+    )
+    for _ in range(3):
+        ours.grad = torchs.grad = torch.randn(shape)
+        for optimizer in both:
+            optimizer.param_groups[0]["lr"] = 1e-2
+            optimizer.step()
+    torch.testing.assert_close(ours - start, torchs - start, rtol=0.05, atol=2e-4)
+
+
+def test_muon_goes_on_from_the_state_that_torchs_left() -> None:
+    torchs = torch.optim.Muon([matrix := torch.randn(8, 16)], adjust_lr_fn="match_rms_adamw")
+    matrix.grad = torch.randn(8, 16)
+    torchs.step()
+    ours = Muon([matrix], weight_decay=0.0)
+    ours.load_state_dict(torchs.state_dict())
+    torch.testing.assert_close(ours.state[matrix]["momentum_buffer"], torchs.state[matrix]["momentum_buffer"])

@@ -197,6 +197,15 @@ def test_a_stopped_run_goes_on_as_if_it_had_not_been_stopped(textures: Path, tmp
         torch.testing.assert_close(resumed.modules[name], weight, msg=name)
 
 
+def test_a_run_is_the_same_whoever_draws_its_scenes(textures: Path, tmp_path: Path) -> None:
+    alone, drawn = (
+        Checkpoint.load(train(CONFIG, textures, tmp_path / str(workers), workers=workers, threads=1))
+        for workers in (0, 2)
+    )
+    for name, weight in alone.modules.items():
+        torch.testing.assert_close(drawn.modules[name], weight, rtol=0, atol=0, msg=name)
+
+
 def test_a_run_of_depth_only_leaves_the_blur_network_as_it_is(textures: Path, tmp_path: Path) -> None:
     first, _ = run(CONFIG, textures, tmp_path / "first")
     config = replace(CONFIG, depth_only=True)
