@@ -44,10 +44,10 @@ def test_a_step_of_filters_is_even_in_all_directions() -> None:
 def test_muon_is_that_of_torch_whose_products_are_in_bfloat16(shape: tuple[int, int]) -> None:
     torch.manual_seed(0)
     ours, torchs = (start := torch.randn(shape)).clone(), start.clone()
-    both: tuple[torch.optim.Optimizer, ...] = (
+    both: list[torch.optim.Optimizer] = [
         Muon([ours], weight_decay=0.1),
         torch.optim.Muon([torchs], weight_decay=0.1, adjust_lr_fn="match_rms_adamw"),
-    )
+    ]
     for _ in range(3):
         ours.grad = torchs.grad = torch.randn(shape)
         for optimizer in both:
@@ -57,7 +57,8 @@ def test_muon_is_that_of_torch_whose_products_are_in_bfloat16(shape: tuple[int, 
 
 
 def test_muon_goes_on_from_the_state_that_torchs_left() -> None:
-    torchs = torch.optim.Muon([matrix := torch.randn(8, 16)], adjust_lr_fn="match_rms_adamw")
+    matrix = torch.randn(8, 16)
+    torchs: torch.optim.Optimizer = torch.optim.Muon([matrix], adjust_lr_fn="match_rms_adamw")
     matrix.grad = torch.randn(8, 16)
     torchs.step()
     ours = Muon([matrix], weight_decay=0.0)
