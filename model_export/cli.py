@@ -26,6 +26,18 @@ Textures = Annotated[Path, typer.Option(help="folder of pictures with LICENCES.m
 Frames = Annotated[
     Path | None, typer.Option(help="sharp pictures with depth, of camind homes: four scenes in ten", exists=True)
 ]
+Teachers = Annotated[
+    list[Path] | None,
+    typer.Option(help="checkpoint or model folder to learn the answers of, too; of several their mean", exists=True),
+]
+Threads = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        help="cores that torch computes on, shared with the workers or not",
+        show_default="those that workers leave",
+    ),
+]
 Checkpoint = Annotated[Path, typer.Option(help="checkpoint file of a run", exists=True, dir_okay=False)]
 
 BLENDER_ENVIRONMENT = Path(".venv-blender")
@@ -70,26 +82,14 @@ def train(
     fresh_decoders: Annotated[
         bool, typer.Option("--fresh-decoders", help="of --weights the encoders alone: decoders and heads begin anew")
     ] = False,
-    teacher: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="checkpoint or model folder to learn the answers of, too; of several their mean", exists=True
-        ),
-    ] = None,
+    teacher: Teachers = None,
     learning_rate: Annotated[float, typer.Option(min=1e-6, max=1e-2, help="before it falls")] = 1e-3,
     setting: Annotated[
         list[str] | None,
         typer.Option(help="anything else of the run: decay_share=0.8, scenes.frame_share=0.5, scenes.k_cam_px=[1,20]"),
     ] = None,
     workers: Annotated[int, typer.Option(min=0, max=64, help="processes that draw scenes")] = 1,
-    threads: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="cores that torch computes on, shared with the workers or not",
-            show_default="those that workers leave",
-        ),
-    ] = None,
+    threads: Threads = None,
     device: Annotated[str, typer.Option(help="torch device")] = "cpu",
 ) -> None:
     """Train a pair of networks on procedural scenes; stop and start it as you like."""

@@ -1,4 +1,4 @@
-"""How many cores torch and OpenCV work on."""
+"""What torch and OpenCV work on: how many cores, and in which numbers."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,3 +22,8 @@ def one_core() -> None:
     """For worker processes: each has a core."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
+
+
+def computes_bfloat16(device: torch.device) -> bool:
+    """Whether the device multiplies bfloat16 itself."""
+    return device.type != "cpu" or torch.cpu._is_avx512_bf16_supported()

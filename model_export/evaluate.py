@@ -476,10 +476,8 @@ def evaluate(
     # renderings side by side, rather than each in pieces on every core
     with torch_threads(1), ThreadPoolExecutor(SETS_AT_ONCE) as pool:
         done = list(pool.map(partial(_examined, models, on_progress), trials))
-    return [
-        _reported(load_model_folder(model).manifest.name, [of_set[number] for of_set in done])
-        for number, model in enumerate(models)
-    ]
+    by_model = zip(models, zip(*done, strict=True), strict=True)
+    return [_reported(load_model_folder(model).manifest.name, sets) for model, sets in by_model]
 
 
 def _reported(model: str, done: Sequence[_Examined]) -> Report:

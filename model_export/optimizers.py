@@ -10,15 +10,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from model_export.cores import computes_bfloat16
+
 MOMENTUM = 0.95
 NEWTON_SCHULZ = (3.4445, -4.775, 2.0315)  # Jordan et al.: the steepest at zero that does not run away
 NEWTON_SCHULZ_STEPS = 5
 RMS_OF_ADAMW = 0.2
-
-
-def computes_bfloat16(device: torch.device) -> bool:
-    """Whether the device multiplies bfloat16 itself."""
-    return device.type != "cpu" or torch.cpu._is_avx512_bf16_supported()
 
 
 def evened(matrix: Tensor, dtype: torch.dtype) -> Tensor:
@@ -50,7 +47,9 @@ class Muon(torch.optim.Optimizer):
         return loss
 
     def _move(self, matrix: Tensor, gradient: Tensor, rate: float, decay: float) -> None:
-        momentum = self.state[matrix].setdefault("momentum_buffer", torch.zeros_like(matrix))
+        if not self.state[matrix]:
+            self.state[matrix]["momentum_buffer"] = torch.zeros_like(matrix)
+        momentum = self.state[matrix]["momentum_buffer"]
         momentum.lerp_(gradient, 1 - MOMENTUM)
         dtype = torch.bfloat16 if computes_bfloat16(matrix.device) else torch.float32
         matrix.mul_(1 - rate * decay)

@@ -24,12 +24,12 @@ from torch.nn.utils import convert_conv2d_weight_memory_format
 from torch.utils.data import DataLoader, Dataset
 
 from model_export.config import Kind, SceneConfig, TrainConfig
-from model_export.cores import torch_threads
+from model_export.cores import computes_bfloat16, torch_threads
 from model_export.folded import folded
 from model_export.frames import load_frames
 from model_export.losses import Batch, run_pair, total_loss
 from model_export.networks import SHIPPED_WIDTHS, Pair, Widths, make_pair, with_fresh_decoders
-from model_export.optimizers import Optimizers, computes_bfloat16
+from model_export.optimizers import Optimizers
 from model_export.progress import progress_bar
 from model_export.restored import restored, spread_norms
 from model_export.scenes import Material, Sample, draw_sample
@@ -360,6 +360,7 @@ def train(
     config = trainer.config
     pool = Pool(config, material, trainer.step, workers)
     test = held_out(config.scenes, material, 2 * config.batch)
+    # by itself not on a core with a worker: two busy processes there cost each far more than half its speed
     with torch_threads(threads or max(1, available_cores() - workers)), progress_bar(console) as progress:
         for _ in progress.track(pool.fill(), total=config.pool, description="scenes"):
             pass
