@@ -10,8 +10,9 @@ import onnxruntime
 import torch
 from rich.table import Table
 
-from model_export import bench_graphs, bench_service
+from model_export import bench_graphs, bench_seams, bench_service
 from model_export.bench_graphs import SIZE, THREADS, NetworkRow, Rate, SizeRow, Timing
+from model_export.bench_seams import SeamRow
 from model_export.bench_service import LoadRow, RequestRow
 from model_export.served import serving
 from service.inference.artifact import load_model_folder
@@ -29,6 +30,7 @@ class SpeedReport:
     networks: list[NetworkRow]
     rates: list[Rate]
     sizes: list[SizeRow]
+    seams: list[SeamRow]
     requests: list[RequestRow]
     load: list[LoadRow]
     peak_memory_mb: dict[str, float]
@@ -50,6 +52,7 @@ def measure(model: Path, rounds: int, seconds: float, on_step: Callable[[], None
         networks = bench_graphs.time_networks(model, Path(scratch), rounds, on_step)
     rates = [rate for threads in THREADS for rate in bench_graphs.machine_rates(threads, LARGE_ROUNDS, on_step)]
     sizes = bench_graphs.time_sizes(model, LARGE_ROUNDS, on_step)
+    seams = bench_seams.compare(model, on_step)
     memory = {}
     with tempfile.TemporaryDirectory() as folder, serving(Path(folder) / "data", "--model", model.absolute()) as server:
         frame = bench_service.time_frames(server, rounds, on_step)
@@ -73,6 +76,7 @@ def measure(model: Path, rounds: int, seconds: float, on_step: Callable[[], None
         networks=networks,
         rates=rates,
         sizes=sizes,
+        seams=seams,
         requests=[frame, *large],
         load=load,
         peak_memory_mb=memory,
@@ -82,12 +86,14 @@ def measure(model: Path, rounds: int, seconds: float, on_step: Callable[[], None
 def steps(rounds: int) -> int:
     """How often ``measure`` tells of progress."""
     graphs = len(THREADS) * (rounds + 1) + (len(THREADS) + 1) * (LARGE_ROUNDS + 1)
-    return graphs + 1 + len(bench_service.CLIENTS) + len(bench_service.PHOTOGRAPHS_K_CAM_PX)
+    return (
+        graphs + 1 + len(bench_seams.BUDGETS) + 1 + len(bench_service.CLIENTS) + len(bench_service.PHOTOGRAPHS_K_CAM_PX)
+    )
 
 
 def tables(report: SpeedReport) -> list[Table]:
     """The report for a terminal."""
-    return [_networks(report), _rates(report), _sizes(report), _requests(report), _load(report)]
+    return [_networks(report), _rates(report), _sizes(report), _seams(report), _requests(report), _load(report)]
 
 
 def _ms(timing: Timing) -> str:
@@ -129,6 +135,16 @@ def _sizes(report: SpeedReport) -> Table:
     table = Table("size", "ms", "cost of a pixel", title=f"Sizes, read at full size, {THREADS[-1]} threads")
     for row in report.sizes:
         table.add_row(f"{row.width_px}x{row.height_px}", _ms(row.timing), f"{row.cost_of_a_pixel:.2f}")
+    return table
+
+
+def _seams(report: SpeedReport) -> Table:
+    width, height = bench_seams.SIZE
+    head = ("tiles", "at borders", "in overlaps", "elsewhere", "the same within 1 %", "largest difference")
+    table = Table(*head, title=f"Steps of ln z in tiles of {width}x{height}, over those of the picture read whole")
+    for row in report.seams:
+        steps = (f"{times:.3f}" for times in (row.borders, row.overlaps, row.elsewhere))
+        table.add_row(str(row.tiles), *steps, f"{row.alike:.1%}", f"{row.largest:.1%}")
     return table
 
 

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 from torch import Tensor
 
 from model_export.datasets.photos import filled
@@ -27,6 +28,7 @@ LEVEL_OFFSET_PX = 0.5
 SLICES_PER_LEVEL = 0.5  # of a picture whose blur varies within each
 MARGIN_SIGMAS = 3.0
 SOFT_EDGE_VARIANCE = 0.25
+UNSEEN = 2e-4  # of the light that comes through what is nearer
 SAMPLED_BELOW_VARIANCE = 0.8
 SAMPLED_TAPS = 8
 
@@ -60,16 +62,16 @@ class Layer:
     defocus_px: Tensor
 
 
+def _sampled(parameter: float) -> tuple[list[float], float]:
+    """Weights at 1, 2, ... px, before normalising, of a sampled Gaussian, and the variance that it has."""
+    weights = [math.exp(-(x**2) / (2 * parameter)) for x in range(1, SAMPLED_TAPS + 1)]
+    return weights, 2 * sum(w * x**2 for x, w in enumerate(weights, 1)) / (1 + 2 * sum(weights))
+
+
 @lru_cache(maxsize=256)
-def _taps(variance: float) -> tuple[float, ...]:
-    """Weights at 1, 2, ... px, before normalising, of the sampled Gaussian that has this variance."""
-    low, high = 1e-3, 2 * SAMPLED_BELOW_VARIANCE  # sampling narrows: look for the parameter that makes up for it
-    for _ in range(40):
-        parameter = (low + high) / 2
-        weights = [math.exp(-(x**2) / (2 * parameter)) for x in range(1, SAMPLED_TAPS + 1)]
-        found = 2 * sum(w * x**2 for x, w in enumerate(weights, 1)) / (1 + 2 * sum(weights))
-        low, high = (parameter, high) if found < variance else (low, parameter)
-    return tuple(weights)
+def _taps(variance: float) -> list[float]:
+    """The weights of the sampled Gaussian that has this variance: sampling narrows, so its parameter is another."""
+    return _sampled(brentq(lambda p: _sampled(p)[1] - variance, 1e-4, 2 * SAMPLED_BELOW_VARIANCE))[0]
 
 
 def _gaussian_transfer(frequency: Tensor, variance: float) -> Tensor:
@@ -200,9 +202,11 @@ def _filled(image: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np.
     _, labels = cv2.distanceTransformWithLabels(
         (~known).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
     )
-    colors = np.zeros((int(labels.max()) + 1, 3), np.float32)
-    colors[labels[known]] = image[known]
-    return np.take(colors, np.asarray(labels, np.int32), axis=0)
+    nearest = np.zeros(int(labels.max()) + 1, np.intp)
+    nearest[labels[known]] = np.flatnonzero(known)
+    out = image.copy()
+    out[~known] = image.reshape(-1, 3)[nearest[labels[~known]]]
+    return out
 
 
 def _slice(linear: NDArray[np.float32], index: NDArray[np.int32], number: int) -> tuple[Tensor, Tensor]:
@@ -226,6 +230,21 @@ def sliced(linear: NDArray[np.float32], defocus_px: NDArray[np.float32]) -> tupl
     return layers, index
 
 
+def _strips(shown: NDArray[np.bool_], lit: NDArray[np.bool_], reach: int) -> tuple[slice, slice]:
+    """Along one side of a picture [n]: where a slice is drawn, and what is blurred for it, with room for its blur.
+
+    It is drawn as far as it reaches from where it is ``shown``, but only where it is ``lit`` through what is nearer.
+    """
+    size = len(shown)
+    (first, last), (first_lit, last_lit) = (np.flatnonzero(seen)[[0, -1]] for seen in (shown, lit))
+    low = max(first - reach, first_lit)
+    high = max(low, min(last + reach, last_lit) + 1)
+    start = max(0, low - reach)
+    length = min(size, cv2.getOptimalDFTSize(min(size, high + reach) - start))
+    start = min(start, size - length)
+    return slice(low, high), slice(start, start + length)
+
+
 def refocus(
     image: NDArray[np.float32], depth_m: NDArray[np.float32], camera: Camera, spread: PointSpread = DISC
 ) -> NDArray[np.float32]:
@@ -245,13 +264,23 @@ def refocus(
     sigma = np.pad(sigma, pad, mode="reflect")
     index = np.pad(_slices(signed), pad, mode="reflect")
 
-    def blurred() -> Iterable[tuple[Tensor, Tensor]]:
-        for number in range(int(index.max()) + 1):
-            level = float(sigma[index == number].mean())
-            out = blur(torch.cat(_slice(linear, index, number)), level, spread)
-            yield out[:3], out[3:]
-
+    levels = np.bincount(index.ravel(), sigma.ravel()) / np.bincount(index.ravel())
+    picture, clear = torch.zeros(3, *index.shape), torch.ones(1, *index.shape)
+    reach = 0
+    for number, level in enumerate(levels):
+        # what is hidden may be seen as far as anything nearer is blurred
+        reach = max(reach, math.ceil(MARGIN_SIGMAS * (level + math.sqrt(SOFT_EDGE_VARIANCE))))
+        shown, lit = index <= number, clear[0].abs().numpy() > UNSEEN
+        if not lit.any():
+            break
+        place, source = zip(*(_strips(shown.any(axis), lit.any(axis), reach) for axis in (1, 0)), strict=True)
+        blurred = blur(torch.cat(_slice(linear[source], index[source], number)), level, spread)
+        own = tuple(slice(to.start - cut.start, to.stop - cut.start) for to, cut in zip(place, source, strict=True))
+        color, alpha = blurred[(slice(3), *own)], blurred[(slice(3, 4), *own)]
+        within = (slice(None), *place)
+        picture[within] += clear[within] * color
+        clear[within] *= 1 - alpha
     rest = math.sqrt(max(camera.gamma_px**2 - thin_lens.PIXEL_BOX_VARIANCE, 0.0))
-    picture = blur(composite(blurred()), rest)
+    picture = blur(picture / (1 - clear).clamp_min(1e-3), rest)
     inner = picture[:, margin : margin + height, margin : margin + width]
     return encode_srgb(inner.permute(1, 2, 0).numpy())

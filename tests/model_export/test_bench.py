@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from model_export import bench_graphs, bench_service
+from model_export import bench_graphs, bench_seams, bench_service
 from model_export.bench_graphs import Timing, graph_flops, in_turns, machine_rates
 from model_export.bench_service import time_load
 from model_export.cli import commands
@@ -20,6 +20,8 @@ def _small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench_graphs, "CONVOLUTION", (8, 12, 16))
     monkeypatch.setattr(bench_graphs, "SIZE", (64, 48))
     monkeypatch.setattr(bench_graphs, "SIZES", ((64, 48), (128, 96)))
+    monkeypatch.setattr(bench_seams, "SIZE", (1000, 64))
+    monkeypatch.setattr(bench_seams, "BUDGETS", (40_000,))
     monkeypatch.setattr(bench_service, "SIZE", (64, 48))
     monkeypatch.setattr(bench_service, "FULL_SIZE", (200, 150))
     monkeypatch.setattr(bench_service, "CLIENTS", (1, 3))
@@ -51,6 +53,15 @@ def test_our_graphs_stay_small() -> None:
     ours, papers = graph_flops("compact", 640, 480), graph_flops("paper", 640, 480)
     assert ours < 12e9
     assert papers > 4 * ours
+
+
+@pytest.mark.usefixtures("_small")
+def test_what_tiles_change_is_told_by_place(tiny_model_dir: Path) -> None:
+    (row,) = bench_seams.compare(tiny_model_dir)
+    assert row.tiles == 2
+    assert row.elsewhere == pytest.approx(1, abs=0.02)
+    assert row.borders > 0
+    assert 0 <= row.alike <= 1
 
 
 @pytest.mark.usefixtures("_small")

@@ -1,0 +1,95 @@
+"""Whether tiles of a large photograph show: the same picture read whole and in tiles, and depth's steps compared."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model_export.bench_graphs import THREADS, camera_for, draw_picture
+from model_export.cases import to_pixels
+from model_export.render import refocus
+from service.inference.artifact import load_model_folder
+from service.inference.estimator import Estimator
+from service.inference.pair import GraphPair
+from service.inference.tiles import Span, layout
+
+SIZE = (2000, 1500)
+BUDGETS = (1_700_000, 900_000)  # pixels of a tile: two tiles, and four
+K_CAM_PX = 3.0
+DEPTHS_M = (0.8, 4.0)  # of a wall that runs away to the right, focused at 2 m
+NEAR_BORDER_PX = 2  # what is read at half size is enlarged
+ALIKE = 0.01
+ELSEWHERE, OVERLAP, BORDER = PLACES = range(3)
+
+Map = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class SeamRow:
+    """Mean steps of ln z from pixel to pixel in tiles, over those of the picture read whole, by where they are.
+
+    ``borders`` are within two pixels of where a tile ends, ``overlaps`` where two tiles are faded into each other.
+    ``alike`` is the share of pixels whose depth is the same within 1 %, ``largest`` the largest relative difference.
+    """
+
+    tiles: int
+    borders: float
+    overlaps: float
+    elsewhere: float
+    alike: float
+    largest: float
+
+
+def compare(model: Path, on_round: Callable[[], None] = lambda: None) -> list[SeamRow]:
+    """Read a drawn picture whole and within each of the budgets."""
+    pair = GraphPair(load_model_folder(model), THREADS[-1])
+    width, height = SIZE
+    camera = camera_for(width, height, K_CAM_PX)
+    inverse = np.linspace(1 / DEPTHS_M[0], 1 / DEPTHS_M[1], width, dtype=np.float32)
+    wall_m = np.ascontiguousarray(np.broadcast_to(1 / inverse, (height, width)))
+    sharp = draw_picture(width, height).astype(np.float32) / np.float32(255)
+    picture = to_pixels(refocus(sharp, wall_m, camera))
+    whole = Estimator(pair, width * height).estimate(picture, camera).depth_m
+    on_round()
+    rows = []
+    for budget in BUDGETS:
+        tiled = Estimator(pair, budget).estimate(picture, camera).depth_m
+        rows.append(_row(whole, tiled, *layout(height, width, pair.manifest.multiple, budget)))
+        on_round()
+    return rows
+
+
+def _row(whole_m: Map, tiled_m: Map, rows: list[Span], columns: list[Span]) -> SeamRow:
+    off = np.abs(tiled_m / whole_m - 1)
+    known = np.isfinite(off)
+    (in_whole, places), (in_tiles, _) = (
+        _steps(np.where(known, np.log(depth_m), np.float32(np.nan)), rows, columns) for depth_m in (whole_m, tiled_m)
+    )
+    times = {place: float(in_tiles[places == place].mean() / in_whole[places == place].mean()) for place in PLACES}
+    return SeamRow(
+        tiles=len(rows) * len(columns),
+        borders=times[BORDER],
+        overlaps=times[OVERLAP],
+        elsewhere=times[ELSEWHERE],
+        alike=float((off[known] < ALIKE).mean()),
+        largest=float(off[known].max()),
+    )
+
+
+def _steps(log_m: Map, rows: list[Span], columns: list[Span]) -> tuple[Map, NDArray[np.int64]]:
+    """Mean absolute step to the next column and to the next row [w + h - 2], and which place each is."""
+    means = [np.nanmean(np.abs(np.diff(log_m, axis=axis)), axis=1 - axis) for axis in (1, 0)]
+    return np.concatenate(means), np.concatenate([_places(columns), _places(rows)])
+
+
+def _places(along: list[Span]) -> NDArray[np.int64]:
+    """Of each step along one axis: across a border, in an overlap, or elsewhere."""
+    places = np.full(along[-1].stop - 1, ELSEWHERE)
+    for one, following in pairwise(along):
+        places[following.start : one.stop] = OVERLAP
+        for border in (following.start, one.stop):
+            places[border - NEAR_BORDER_PX : border + NEAR_BORDER_PX] = BORDER
+    return places
