@@ -17,7 +17,7 @@ from service.inference.pair import GraphPair
 from service.inference.tiles import Span, layout
 
 SIZE = (2000, 1500)
-BUDGETS = (1_700_000, 900_000)  # pixels of a tile: two tiles, and four
+BUDGETS = (1_700_000, 900_000)  # pixels of a tile: two tiles, and six
 K_CAM_PX = 3.0
 DEPTHS_M = (0.8, 4.0)  # of a wall that runs away to the right, focused at 2 m
 NEAR_BORDER_PX = 2  # what is read at half size is enlarged
@@ -48,8 +48,8 @@ def compare(model: Path, on_round: Callable[[], None] = lambda: None) -> list[Se
     pair = GraphPair(load_model_folder(model), THREADS[-1])
     width, height = SIZE
     camera = camera_for(width, height, K_CAM_PX)
-    inverse = np.linspace(1 / DEPTHS_M[0], 1 / DEPTHS_M[1], width, dtype=np.float32)
-    wall_m = np.ascontiguousarray(np.broadcast_to(1 / inverse, (height, width)))
+    away_m = 1 / np.linspace(1 / DEPTHS_M[0], 1 / DEPTHS_M[1], width)
+    wall_m = np.tile(away_m.astype(np.float32), (height, 1))
     sharp = draw_picture(width, height).astype(np.float32) / np.float32(255)
     picture = to_pixels(refocus(sharp, wall_m, camera))
     whole = Estimator(pair, width * height).estimate(picture, camera).depth_m

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from model_export.config import SceneConfig
 from model_export.datasets.photos import Photo, filled, load_photos
 from model_export.render import refocus
-from model_export.scenes import draw_sample, true_blur_px
+from model_export.scenes import draw_sample, draw_shot, true_blur_px
 from model_export.train import HELD_OUT_SEED
 from service.inference.pair import Side
 from service.optics import thin_lens
@@ -177,8 +177,11 @@ def _near_steps(depth_m: Map) -> NDArray[np.bool_]:
 
 def procedural_cases(count: int, side: int, first: int = 0) -> Iterator[Case]:
     """Procedural scenes of seeds and textures that no training drew: all nearer (-1), farther (1), or both (0)."""
-    drawn = (draw_sample(HELD_OUT_SEED + number, SceneConfig()) for number in itertools.count(first))
-    for sample in itertools.islice((s for s in drawn if s.shot.side == side), count):
+    config = SceneConfig()
+    seeds = (HELD_OUT_SEED + number for number in itertools.count(first))
+    # a scene's shot comes first: those of other sides need not be drawn
+    fitting = (seed for seed in seeds if draw_shot(np.random.default_rng(seed), config).side == side)
+    for sample in (draw_sample(seed, config) for seed in itertools.islice(fitting, count)):
         shot = sample.shot
         height, width = sample.excess.shape
         inner = Intrinsics.centred(shot.focal_length_px, width, height)

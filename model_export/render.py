@@ -230,13 +230,13 @@ def sliced(linear: NDArray[np.float32], defocus_px: NDArray[np.float32]) -> tupl
     return layers, index
 
 
-def _strips(shown: NDArray[np.bool_], lit: NDArray[np.bool_], reach: int) -> tuple[slice, slice]:
-    """Along one side of a picture [n]: where a slice is drawn, and what is blurred for it, with room for its blur.
+def _strips(shown: NDArray[np.bool_], lit: NDArray[np.bool_], axis: int, reach: int) -> tuple[slice, slice]:
+    """Along one axis of a picture [h,w]: where a slice is drawn, and what is blurred for it, with room for its blur.
 
     It is drawn as far as it reaches from where it is ``shown``, but only where it is ``lit`` through what is nearer.
     """
-    size = len(shown)
-    (first, last), (first_lit, last_lit) = (np.flatnonzero(seen)[[0, -1]] for seen in (shown, lit))
+    size = shown.shape[axis]
+    (first, last), (first_lit, last_lit) = (np.flatnonzero(seen.any(1 - axis))[[0, -1]] for seen in (shown, lit))
     low = max(first - reach, first_lit)
     high = max(low, min(last + reach, last_lit) + 1)
     start = max(0, low - reach)
@@ -273,7 +273,7 @@ def refocus(
         shown, lit = index <= number, clear[0].abs().numpy() > UNSEEN
         if not lit.any():
             break
-        place, source = zip(*(_strips(shown.any(axis), lit.any(axis), reach) for axis in (1, 0)), strict=True)
+        place, source = zip(*(_strips(shown, lit, axis, reach) for axis in (0, 1)), strict=True)
         blurred = blur(torch.cat(_slice(linear[source], index[source], number)), level, spread)
         own = tuple(slice(to.start - cut.start, to.stop - cut.start) for to, cut in zip(place, source, strict=True))
         color, alpha = blurred[(slice(3), *own)], blurred[(slice(3, 4), *own)]
