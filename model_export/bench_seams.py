@@ -65,8 +65,9 @@ def compare(model: Path, on_round: Callable[[], None] = lambda: None) -> list[Se
 def _row(whole_m: Map, tiled_m: Map, rows: list[Span], columns: list[Span]) -> SeamRow:
     off = np.abs(tiled_m / whole_m - 1)
     known = np.isfinite(off)
-    (in_whole, places), (in_tiles, _) = (
-        _steps(np.where(known, np.log(depth_m), np.float32(np.nan)), rows, columns) for depth_m in (whole_m, tiled_m)
+    places = np.concatenate([_places(rows), _places(columns)])
+    in_whole, in_tiles = (
+        _steps(np.where(known, np.log(depth_m), np.float32(np.nan))) for depth_m in (whole_m, tiled_m)
     )
     times = {place: float(in_tiles[places == place].mean() / in_whole[places == place].mean()) for place in PLACES}
     return SeamRow(
@@ -79,10 +80,9 @@ def _row(whole_m: Map, tiled_m: Map, rows: list[Span], columns: list[Span]) -> S
     )
 
 
-def _steps(log_m: Map, rows: list[Span], columns: list[Span]) -> tuple[Map, NDArray[np.int64]]:
-    """Mean absolute step to the next column and to the next row [w + h - 2], and which place each is."""
-    means = [np.nanmean(np.abs(np.diff(log_m, axis=axis)), axis=1 - axis) for axis in (1, 0)]
-    return np.concatenate(means), np.concatenate([_places(columns), _places(rows)])
+def _steps(log_m: Map) -> Map:
+    """Mean absolute step from each row to the next, then from each column to the next [h + w - 2]."""
+    return np.concatenate([np.nanmean(np.abs(np.diff(log_m, axis=axis)), axis=1 - axis) for axis in (0, 1)])
 
 
 def _places(along: list[Span]) -> NDArray[np.int64]:

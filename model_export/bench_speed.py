@@ -86,9 +86,8 @@ def measure(model: Path, rounds: int, seconds: float, on_step: Callable[[], None
 def steps(rounds: int) -> int:
     """How often ``measure`` tells of progress."""
     graphs = len(THREADS) * (rounds + 1) + (len(THREADS) + 1) * (LARGE_ROUNDS + 1)
-    return (
-        graphs + 1 + len(bench_seams.BUDGETS) + 1 + len(bench_service.CLIENTS) + len(bench_service.PHOTOGRAPHS_K_CAM_PX)
-    )
+    seams = 1 + len(bench_seams.BUDGETS)
+    return graphs + seams + 1 + len(bench_service.CLIENTS) + len(bench_service.PHOTOGRAPHS_K_CAM_PX)
 
 
 def tables(report: SpeedReport) -> list[Table]:
