@@ -8,6 +8,7 @@ from typing import Any, Literal
 from pydantic import TypeAdapter, ValidationError
 
 Kind = Literal["compact", "paper"]
+Learning = Literal["all", "depth", "layout"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +58,9 @@ class TrainConfig:
     """A training run: ``steps`` batches, drawn from a pool that ``fresh_per_step`` new scenes flow through.
 
     The last ``settled_share`` of the steps has the batch norms' statistics fixed, as the exported network has: all of
-    them in a run that begins with weights, decoders' too. A ``taught`` run learns teachers' answers too; one that is
-    ``depth_only`` leaves the blur network as it is.
+    them in a run that begins with weights, decoders' too. A ``taught`` run learns teachers' answers too. ``learning``
+    is what moves: all, the depth network alone, or of it only what tells the side by the layout. Of the pictures
+    ``turned_share`` do not stay upright, and for ``hint_share`` a side is asked for.
     """
 
     kind: Kind = "compact"
@@ -73,10 +75,12 @@ class TrainConfig:
     b_weight: float = 1.0
     side_weight: float = 0.3
     taught: bool = False
-    depth_only: bool = False
+    learning: Learning = "all"
     likeness_weight: float = 10.0
     pool: int = 600
     fresh_per_step: float = 1.0
+    turned_share: float = 0.3
+    hint_share: float = 0.5
     checkpoint_every: int = 250
     settled_share: float = 0.35
     settle_batches: int = 60

@@ -296,16 +296,42 @@ class UNet(nn.Module):
         self.surroundings = nn.Sequential(*(Surroundings(coarsest, d) for d in dilations))
 
     def forward(self, *inputs: Tensor, joined: Features = ()) -> Features:
-        """The encoder's skips, finest first, and last the finest decoder map."""
+        """The encoder's skips, finest first, the coarsest map, and last the finest decoder map."""
         x = self.encoder[0](*inputs)
         skips = [x]
         for block in itertools.islice(self.encoder, 1, None):
             x = block(functional.max_pool2d(x, 2))
             skips.append(x)
-        x = self.surroundings(x)
+        skips[-1] = x = self.surroundings(x)
         for i in reversed(range(len(self.decoder))):
             x = self.decoder[i](x, skips[i], *joined[i : i + 1])
-        return (*skips[:-1], x)
+        return (*skips, x)
+
+
+class Layout(nn.Module):
+    """What the arrangement of a picture adds to the log odds of near [n,1,h,w], from the coarsest map of a U-Net.
+
+    A floor is nearer below, what stands before a wall is nearer than it: that is seen from afar alone. Each of the
+    residual convolutions with holes looks twice as far as the one before. In the beginning it adds nothing.
+    """
+
+    WIDTH = 32
+    DILATIONS = (1, 2, 4, 8)
+
+    def __init__(self, coarsest: int, halvings: int) -> None:
+        super().__init__()
+        first = Block(*plain_layers(coarsest, self.WIDTH))
+        self.look = nn.Sequential(first, *(Surroundings(self.WIDTH, d) for d in self.DILATIONS))
+        self.head = nn.Conv2d(self.WIDTH, 1, 1)
+        self.times = 2.0**halvings
+        nn.init.zeros_(self.head.weight)
+        nn.init.zeros_(self.head.get_parameter("bias"))
+
+    def forward(self, coarse: Tensor) -> Tensor:
+        seen = self.look(coarse)
+        with torch.autocast(coarse.device.type, enabled=False):
+            odds = functional.conv2d(seen.float(), self.head.weight, self.head.bias)
+        return functional.interpolate(odds, scale_factor=self.times, mode="bilinear", align_corners=False)
 
 
 def _compact_unet(first: Normed, widths: tuple[int, ...], dilations: tuple[int, ...]) -> UNet:
@@ -367,7 +393,7 @@ class CompactDepth(nn.Module):
     """Ours: starts from the plain inversion and mixes in what the surroundings say, by a learned gate.
 
     Where blur is certain the gate lets eq. 7 through; on flat ground the free estimate fills in. Either way
-    near stays at or before the plane in focus and far behind it.
+    near stays at or before the plane in focus and far behind it. Which it is the finest map tells, and the layout.
     """
 
     DILATIONS = (2, 4)
@@ -378,6 +404,7 @@ class CompactDepth(nn.Module):
         finest = widths[0]
         first = Normed(convolution(features, finest), convolution(self.PLANES, finest))
         self.unet = _compact_unet(first, widths, self.DILATIONS)
+        self.layout = Layout(widths[-1], len(widths) - 1)
         self.head = nn.Conv2d(finest, 5, 1)
         with torch.no_grad():
             self.head.weight.mul_(0.1)
@@ -392,14 +419,15 @@ class CompactDepth(nn.Module):
             planes = [torch.log(scene.focus_distance_m), focal, known, scene.side]
             inputs = [near, far, defocus.clamp(max=3.0), torch.log(spread.clamp(1e-3, 10.0)) * 0.3]
             inputs += [_plane(p, defocus) for p in planes]
-        x = self.unet(*features, torch.cat(inputs, 1))[-1]
+        *_, coarsest, x = self.unet(*features, torch.cat(inputs, 1))
+        near_logit = self.layout(coarsest)
         with torch.autocast(defocus.device.type, enabled=False):
             out = functional.conv2d(x.float(), self.head.weight, self.head.bias)
             free_near, free_far = functional.logsigmoid(-out[:, 0:1]), -functional.logsigmoid(-out[:, 1:2])
             gate = torch.sigmoid(out[:, 2:3])
             log_near = (gate * near + (1 - gate) * free_near).clamp(-RATIO_BOUND, 0.0)
             log_far = (gate * far + (1 - gate) * free_far).clamp(0.0, RATIO_BOUND)
-        return DepthEstimate(log_near, log_far, out[:, 3:4], _bounded_log_error(out[:, 4:5]))
+        return DepthEstimate(log_near, log_far, near_logit + out[:, 3:4], _bounded_log_error(out[:, 4:5]))
 
 
 class PaperBlur(nn.Module):
@@ -414,7 +442,7 @@ class PaperBlur(nn.Module):
         self.head = nn.Conv2d(self.WIDTHS[0], 1, 1)
 
     def forward(self, image: Tensor) -> BlurEstimate:
-        *skips, x = self.unet(image)
+        *skips, _, x = self.unet(image)
         with torch.autocast(image.device.type, enabled=False):
             raw = functional.conv2d(x.float(), self.head.weight, self.head.bias)
         blur_px = functional.softplus(raw + self.START_PX).clamp(*BLUR_BOUNDS_PX)

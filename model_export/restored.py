@@ -62,7 +62,7 @@ def _normed(pair: Pair) -> list[Normed]:
 
 
 def _heads(pair: Pair) -> list[nn.Module]:
-    return [network.get_submodule("head") for network in (pair.blur, pair.depth)]
+    return [pair.blur.get_submodule("head"), pair.depth.get_submodule("head"), pair.depth.get_submodule("layout.head")]
 
 
 def spread_norms(pair: Pair, passes: Iterable[Callable[[], object]]) -> None:

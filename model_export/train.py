@@ -23,7 +23,7 @@ from torch import nn
 from torch.nn.utils import convert_conv2d_weight_memory_format
 from torch.utils.data import DataLoader, Dataset
 
-from model_export.config import Kind, SceneConfig, TrainConfig
+from model_export.config import Kind, Learning, SceneConfig, TrainConfig
 from model_export.cores import computes_bfloat16, torch_threads
 from model_export.folded import folded
 from model_export.frames import load_frames
@@ -37,11 +37,10 @@ from model_export.textures import load_photographs
 from service.cores import available_cores
 
 FOCAL_UNKNOWN_SHARE = 0.3
-SIDE_HINT_SHARE = 0.5
-TURNED_SHARE = 0.3  # most are left upright: below is nearer, as in most photographs
 # a camera known by its specs has a guess for gamma: mostly too low a one, since motion, haze and filters add softness
 GUESSED_GAMMA_SHARE, GUESSED_GAMMA = 0.6, (-0.2, 0.35)  # mean and standard deviation of the guess's log error
 HELD_OUT_SEED = 2**40
+UNCHANGED = TrainConfig()
 
 
 class SceneStream(Dataset[Sample]):
@@ -101,7 +100,8 @@ class Pool:
     def batch(self, step: int) -> Batch:
         """The batch of a step: scenes, flips, hints and all follow from seed and step."""
         rng = np.random.default_rng((self.config.seed, step))
-        return collate([self.samples[i] for i in rng.integers(0, len(self.samples), self.config.batch)], rng)
+        chosen = rng.integers(0, len(self.samples), self.config.batch)
+        return collate([self.samples[i] for i in chosen], rng, self.config)
 
     def settling(self) -> Iterator[Batch]:
         """Batches of the pool as it is that no step draws, for batch norms to settle on."""
@@ -113,20 +113,21 @@ class Pool:
             self.samples.append(next(self.stream))
 
 
-def collate(samples: list[Sample], rng: np.random.Generator) -> Batch:
+def collate(samples: list[Sample], rng: np.random.Generator, config: TrainConfig = UNCHANGED) -> Batch:
     """Samples to tensors, flipped and turned at random, focal length shown or not, gamma told or guessed.
 
-    A side is asked for at times, of scenes on both sides either: a near thing may stand before a far background.
+    Most are left upright: below is nearer, as in most photographs. A side is asked for at times, of scenes on both
+    sides either: a near thing may stand before a far background.
     """
     images, excesses, rows = [], [], []
     for sample in samples:
-        turns = int(rng.integers(4)) if rng.random() < TURNED_SHARE else 0
+        turns = int(rng.integers(4)) if rng.random() < config.turned_share else 0
         flip = int(rng.choice([-1, 1]))
         images.append(np.rot90(sample.image, turns, (1, 2))[:, :, ::flip].copy())
         excesses.append(np.rot90(sample.excess, turns)[:, ::flip].astype(np.float32))
         shot = sample.shot
         focal = 0.0 if rng.random() < FOCAL_UNKNOWN_SHARE else shot.focal_length_px
-        side = (shot.side or int(rng.choice([-1, 1]))) if rng.random() < SIDE_HINT_SHARE else 0
+        side = (shot.side or int(rng.choice([-1, 1]))) if rng.random() < config.hint_share else 0
         guess = math.exp(rng.normal(*GUESSED_GAMMA)) if rng.random() < GUESSED_GAMMA_SHARE else 1.0
         rows.append((shot.k_cam_px, shot.gamma_px, guess * shot.gamma_px, shot.focus_distance_m, focal, side))
     columns = torch.tensor(rows, dtype=torch.float32).unbind(1)
@@ -166,8 +167,12 @@ class Checkpoint:
 
     @classmethod
     def load(cls, path: Path) -> "Checkpoint":
+        """Raises ``ValueError`` for a checkpoint of another version."""
         content = torch.load(path, map_location="cpu", weights_only=True)
-        config = TrainConfig.from_dict(content["config"])
+        try:
+            config = TrainConfig.from_dict(content["config"])
+        except TypeError as exc:
+            raise ValueError(f"{path} was written by another version of camind: {exc}") from exc
         return cls(config, content["step"], content["modules"], content.get("optimizers", []))
 
     def averaged(self, other: "Checkpoint", share: float = 0.5) -> "Checkpoint":
@@ -205,6 +210,15 @@ def starting_pair(weights: Path, kind: Kind) -> Pair:
     return pair
 
 
+def _learning(pair: Pair, modules: nn.ModuleDict, part: Learning) -> nn.Module:
+    """What of a pair moves in a run; the rest is held as it is."""
+    if part == "all":
+        return modules
+    learning = pair.depth if part == "depth" else pair.depth.get_submodule("layout")
+    modules.requires_grad_(requires_grad=False)
+    return learning.requires_grad_()
+
+
 def learning_rate(config: TrainConfig, step: int) -> float:
     """Warm-up, a level stretch, and a straight fall to nothing over the last ``decay_share`` of the steps."""
     left = (config.steps - step) / max(1.0, config.steps * config.decay_share)
@@ -238,8 +252,7 @@ class Trainer:
         self.pair = make_pair(config.kind, widths if resume is None else Widths.of(resume.modules))
         self.modules = self.pair.modules().to(self.device)
         convert_conv2d_weight_memory_format(self.modules, torch.channels_last)
-        self.pair.blur.requires_grad_(not config.depth_only)
-        self.learning: nn.Module = self.pair.depth if config.depth_only else self.modules
+        self.learning = _learning(self.pair, self.modules, config.learning)
         self.optimizers = Optimizers(self.modules, config.weight_decay)
         self.teachers: list[Pair] = []
         self.step = 0
@@ -405,8 +418,8 @@ def _opened(
 ) -> tuple[Trainer, Pair | None]:
     """The trainer of a run, as its checkpoint left it if there is one, and the networks that a new run begins with.
 
-    With such networks the norms' statistics stay as they are, but where decoders begin anew: a batch's own would undo
-    much of what was learned.
+    With such networks the norms' statistics stay as they are, but where decoders begin anew, or the layout's part is
+    learned apart: a batch's own would undo much of what was learned.
     """
     resume = Checkpoint.load(path) if path.exists() else None
     if resume is not None and resume.config.taught != bool(teachers):
@@ -418,7 +431,7 @@ def _opened(
         trainer = Trainer(replace(config, settled_share=resume.config.settled_share), device, resume)
     elif start is not None:
         widths = Widths.of(start.modules().state_dict())
-        begun = config if fresh_decoders else replace(config, settled_share=1.0)
+        begun = config if fresh_decoders or config.learning == "layout" else replace(config, settled_share=1.0)
         trainer = Trainer(begun, device, widths=widths)
     else:
         trainer = Trainer(config, device)

@@ -33,6 +33,13 @@ def test_a_view_shows_what_it_says_the_depth_of(size: int) -> None:
         assert (dark == (depth_m < 2)).mean() > 0.97  # all but the edge
 
 
+def test_a_frame_is_not_made_smaller_than_a_window_of_it() -> None:
+    """At 0.65 of its size this one is 78 pixels high."""
+    grown = [draw_view(np.random.default_rng(seed), frame(), 114)[2] / 130 for seed in range(20)]
+    assert min(grown) >= 0.95
+    assert max(grown) > 0.98
+
+
 def test_frames_that_look_far_are_drawn_more_often() -> None:
     """One that looks sixteen times as far 32 times as often."""
     near, far = frame(0.25, 0.25), frame(4.0, 4.0)

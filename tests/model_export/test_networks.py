@@ -9,7 +9,7 @@ from torch.nn import functional
 from model_export.config import Kind, TrainConfig
 from model_export.folded import folded
 from model_export.losses import STANDING_OUT, Batch, correct, run_pair, standing_out, total_loss
-from model_export.networks import LUMINANCE, BandEnergy, Surroundings, make_pair, parameter_count
+from model_export.networks import LUMINANCE, BandEnergy, Layout, Surroundings, make_pair, parameter_count
 from model_export.render import blur
 
 KINDS: list[Kind] = ["compact", "paper"]
@@ -150,3 +150,21 @@ def test_correction_takes_the_camera_out() -> None:
     one, _ = correct(seen, 0.1 * ones, 2 * ones, 0.0)
     other, _ = correct(wider, 0.3 * ones, 6 * ones, 0.0)
     torch.testing.assert_close(one, other)
+
+
+def test_the_layout_says_nothing_at_first_and_looks_far_once_it_learned() -> None:
+    """A cell of its map, 16 pixels of the picture, is told by those up to 16 away."""
+    torch.manual_seed(0)
+    layout = Layout(coarsest=48, halvings=3).eval()
+    coarse = torch.rand(1, 48, 40, 40)
+    assert layout(coarse).shape == (1, 1, 320, 320)
+    assert (layout(coarse) == 0).all()
+    for part in layout.modules():
+        if isinstance(part, Surroundings):
+            torch.nn.init.ones_(part.change.norm.get_parameter("weight"))
+    torch.nn.init.normal_(layout.head.weight)
+    other = coarse.clone()
+    other[..., 20, 36] += 1.0
+    moved = (layout(other) - layout(coarse)).abs().amax((0, 1)) > 0
+    assert moved[164, 164]
+    assert not moved[:, :140].any()

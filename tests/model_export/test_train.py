@@ -13,7 +13,7 @@ import pytest
 import torch
 from rich.console import Console
 
-from model_export.config import SceneConfig, TrainConfig
+from model_export.config import Learning, SceneConfig, TrainConfig
 from model_export.cores import torch_threads
 from model_export.folded import folded
 from model_export.losses import likeness_loss, reduced, run_pair, told_by, total_loss
@@ -206,13 +206,17 @@ def test_a_run_is_the_same_whoever_draws_its_scenes(textures: Path, tmp_path: Pa
         torch.testing.assert_close(drawn.modules[name], weight, rtol=0, atol=0, msg=name)
 
 
-def test_a_run_of_depth_only_leaves_the_blur_network_as_it_is(textures: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("learning", "part"), [("depth", "depth."), ("layout", "depth.layout.")])
+def test_a_run_moves_what_is_to_learn_and_nothing_else(
+    learning: Learning, part: str, textures: Path, tmp_path: Path
+) -> None:
     first, _ = run(CONFIG, textures, tmp_path / "first")
-    config = replace(CONFIG, depth_only=True)
+    config = replace(CONFIG, learning=learning)
     path = train(config, textures, tmp_path / "next", weights=tmp_path / "first" / "checkpoint.pt", workers=0)
     after = Checkpoint.load(path)
-    moved = {name.split(".")[0] for name, own in first.modules.items() if not torch.equal(own, after.modules[name])}
-    assert moved == {"depth"}
+    moved = {name for name, own in first.modules.items() if not torch.equal(own, after.modules[name])}
+    assert "depth.layout.head.weight" in moved
+    assert all(name.startswith(part) for name in moved)
 
 
 def test_statistics_follow_the_batches_until_they_are_settled() -> None:
@@ -342,3 +346,13 @@ def test_a_run_that_began_with_a_teacher_goes_on_with_one(textures: Path, tmp_pa
     with pytest.raises(ValueError, match="begun with a --teacher: go on with one"):
         train(CONFIG, textures, folder, workers=0)
     assert Checkpoint.load(train(CONFIG, textures, folder, teachers=[SHIPPED], workers=0)).step == CONFIG.steps
+
+
+def test_a_checkpoint_of_another_version_says_so(textures: Path, tmp_path: Path) -> None:
+    train(CONFIG, textures, tmp_path, workers=0)
+    path = tmp_path / "checkpoint.pt"
+    content = torch.load(path, weights_only=True)
+    content["config"]["forgotten"] = 1
+    torch.save(content, path)
+    with pytest.raises(ValueError, match="another version"):
+        Checkpoint.load(path)
