@@ -140,6 +140,7 @@ def test_decoders_that_begin_anew_leave_the_encoders_as_they_were() -> None:
         "blur",
         "blur.unet",
         "depth",
+        "depth.layout",
         "depth.unet",
     }
     assert not any(".encoder." in name or ".surroundings." in name for name in fresh)
