@@ -211,9 +211,14 @@ def starting_pair(weights: Path, kind: Kind) -> Pair:
 
 
 def _learning(pair: Pair, modules: nn.ModuleDict, part: Learning) -> nn.Module:
-    """What of a pair moves in a run; the rest is held as it is."""
+    """What of a pair moves in a run; the rest is held as it is.
+
+    Raises ``ValueError`` for a part that the pair does not have.
+    """
     if part == "all":
         return modules
+    if part == "layout" and pair.kind != "compact":
+        raise ValueError(f"a {pair.kind} pair has no layout to learn")
     learning = pair.depth if part == "depth" else pair.depth.get_submodule("layout")
     modules.requires_grad_(requires_grad=False)
     return learning.requires_grad_()

@@ -220,6 +220,11 @@ def test_a_run_moves_what_is_to_learn_and_nothing_else(
     assert all(name.startswith(part) for name in moved)
 
 
+def test_the_papers_pair_has_no_layout_to_learn() -> None:
+    with pytest.raises(ValueError, match="a paper pair has no layout"):
+        Trainer(replace(CONFIG, kind="paper", learning="layout"), "cpu")
+
+
 def test_statistics_follow_the_batches_until_they_are_settled() -> None:
     batch = collate([draw_sample(seed, SCENES) for seed in range(2)], np.random.default_rng(0))
     trainer = Trainer(CONFIG, "cpu")
