@@ -13,7 +13,8 @@ def card_text(name: str, ranges: Ranges, training: Training, parameters: int, so
     return f"""# {name}
 
 Depth in metres from the defocus blur of one photograph, for any camera whose k_cam and gamma are known.
-Two graphs: `blur.onnx` reads blur, `depth.onnx` turns camera-corrected blur into depth. {parameters:,} parameters.
+Two graphs: `blur.onnx` reads blur, `depth.onnx` turns camera-corrected blur into depth; a part of the second is
+`layout.onnx` too, for photographs of more than 640 px. {parameters:,} parameters.
 
 ## Use
 

@@ -1,4 +1,4 @@
-"""A checkpoint to a model folder: blur.onnx, depth.onnx, the model card, and last the manifest."""
+"""A checkpoint to a model folder: blur.onnx, depth.onnx, layout.onnx, the model card, and last the manifest."""
 
 import logging
 import subprocess
@@ -15,7 +15,16 @@ from torch import Tensor, nn
 from model_export.card import card_text
 from model_export.config import SceneConfig, TrainConfig
 from model_export.folded import folded
-from model_export.networks import BLUR_BOUNDS_PX, MULTIPLE, Features, Pair, Scene, parameter_count
+from model_export.networks import (
+    BLUR_BOUNDS_PX,
+    MULTIPLE,
+    CompactDepth,
+    Features,
+    LaidOutEstimate,
+    Pair,
+    Scene,
+    parameter_count,
+)
 from model_export.train import Checkpoint
 from service.inference.artifact import (
     CardFile,
@@ -63,12 +72,25 @@ class _DepthGraph(nn.Module):
         self, defocus: Tensor, spread: Tensor, focus: Tensor, focal: Tensor, side: Tensor, features: Features
     ) -> tuple[Tensor, ...]:
         out = self.network(defocus, spread, Scene(focus, focal, side), features)
-        return out.log_ratio_near, out.log_ratio_far, torch.sigmoid(out.near_logit), out.log_scale
+        layout = (out.layout_map, out.layout_odds) if isinstance(out, LaidOutEstimate) else ()
+        return out.log_ratio_near, out.log_ratio_far, torch.sigmoid(out.near_logit), out.log_scale, *layout
+
+
+class _LayoutGraph(nn.Module):
+    """What the depth network says of the layout, for a map that is put together of several."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, layout_map: Tensor) -> tuple[Tensor, ...]:
+        return (self.network(layout_map),)
 
 
 BLUR_OUTPUTS = ("blur_px", "blur_log_error")
 DEPTH_INPUTS = ("relative_defocus", "relative_defocus_spread", "focus_distance_m", "focal_length_px", "side")
 DEPTH_OUTPUTS = ("log_ratio_near", "log_ratio_far", "p_near", "log_scale")
+LAYOUT_INPUTS, LAYOUT_OUTPUTS = ("layout_map",), ("layout_odds",)
 
 
 def feature_names(count: int) -> tuple[str, ...]:
@@ -76,7 +98,7 @@ def feature_names(count: int) -> tuple[str, ...]:
 
 
 def export_graphs(pair: Pair, folder: Path) -> Graphs:
-    """Write both graphs for any batch and any size that is a multiple of 16; what the manifest says of them."""
+    """Write the graphs for any batch and any size that is a multiple of 16; what the manifest says of them."""
     pair = folded(pair)
     height, width = EXAMPLE_SIZE
     image = torch.rand(2, 3, height, width)
@@ -87,8 +109,14 @@ def export_graphs(pair: Pair, folder: Path) -> Graphs:
     numbers = [torch.ones(2), torch.full((2,), 500.0), torch.zeros(2)]
     inputs = (torch.rand(cells) + 0.1, torch.rand(cells) + 0.1, *numbers, seen.features)
     blur = _write(_BlurGraph(pair.blur), (image,), ("image",), BLUR_OUTPUTS + names, folder / "blur.onnx")
-    depth = _write(_DepthGraph(pair.depth), inputs, DEPTH_INPUTS + names, DEPTH_OUTPUTS, folder / "depth.onnx")
-    return Graphs(blur=blur, depth=depth)
+    outputs, layout = DEPTH_OUTPUTS, None
+    if isinstance(pair.depth, CompactDepth):
+        outputs += LAYOUT_INPUTS + LAYOUT_OUTPUTS
+        layout_map = torch.rand(2, pair.depth.coarsest, height // MULTIPLE, width // MULTIPLE)
+        graph = _LayoutGraph(pair.depth.layout)
+        layout = _write(graph, (layout_map,), LAYOUT_INPUTS, LAYOUT_OUTPUTS, folder / "layout.onnx")
+    depth = _write(_DepthGraph(pair.depth), inputs, DEPTH_INPUTS + names, outputs, folder / "depth.onnx")
+    return Graphs(blur=blur, depth=depth, layout=layout)
 
 
 def _free_sizes(tensors: Tensors) -> Any:

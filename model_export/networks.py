@@ -52,6 +52,14 @@ class DepthEstimate:
 
 
 @dataclass(frozen=True, slots=True)
+class LaidOutEstimate(DepthEstimate):
+    """With the coarsest map [n,c,h,w], which the layout is seen in, and what that adds to the logit [n,1,h,w]."""
+
+    layout_map: Tensor
+    layout_odds: Tensor
+
+
+@dataclass(frozen=True, slots=True)
 class Scene:
     """What the depth network knows besides the picture, each [n]: metres, pixels (0 = unknown), -1/0/+1."""
 
@@ -309,7 +317,7 @@ class UNet(nn.Module):
 
 
 class Layout(nn.Module):
-    """What the arrangement of a picture adds to the log odds of near [n,1,h,w], from the coarsest map of a U-Net.
+    """What the arrangement of a picture adds to the log odds of near [n,1,h,w], from a U-Net's coarsest map [n,c,h,w].
 
     A floor is nearer below, what stands before a wall is nearer than it: that is seen from afar alone. Each of the
     residual convolutions with holes looks twice as far as the one before. In the beginning it adds nothing.
@@ -318,20 +326,18 @@ class Layout(nn.Module):
     WIDTH = 32
     DILATIONS = (1, 2, 4, 8)
 
-    def __init__(self, coarsest: int, halvings: int) -> None:
+    def __init__(self, coarsest: int) -> None:
         super().__init__()
         first = Block(*plain_layers(coarsest, self.WIDTH))
         self.look = nn.Sequential(first, *(Surroundings(self.WIDTH, d) for d in self.DILATIONS))
         self.head = nn.Conv2d(self.WIDTH, 1, 1)
-        self.times = 2.0**halvings
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.get_parameter("bias"))
 
     def forward(self, coarse: Tensor) -> Tensor:
         seen = self.look(coarse)
         with torch.autocast(coarse.device.type, enabled=False):
-            odds = functional.conv2d(seen.float(), self.head.weight, self.head.bias)
-        return functional.interpolate(odds, scale_factor=self.times, mode="bilinear", align_corners=False)
+            return functional.conv2d(seen.float(), self.head.weight, self.head.bias)
 
 
 def _compact_unet(first: Normed, widths: tuple[int, ...], dilations: tuple[int, ...]) -> UNet:
@@ -404,13 +410,14 @@ class CompactDepth(nn.Module):
         finest = widths[0]
         first = Normed(convolution(features, finest), convolution(self.PLANES, finest))
         self.unet = _compact_unet(first, widths, self.DILATIONS)
-        self.layout = Layout(widths[-1], len(widths) - 1)
+        self.coarsest, self.times = widths[-1], 2.0 ** (len(widths) - 1)
+        self.layout = Layout(self.coarsest)
         self.head = nn.Conv2d(finest, 5, 1)
         with torch.no_grad():
             self.head.weight.mul_(0.1)
             self.head.get_parameter("bias").copy_(torch.tensor([-0.5, -0.5, 1.5, 0.0, -1.5]))
 
-    def forward(self, defocus: Tensor, spread: Tensor, scene: Scene, features: Features) -> DepthEstimate:
+    def forward(self, defocus: Tensor, spread: Tensor, scene: Scene, features: Features) -> LaidOutEstimate:
         with torch.autocast(defocus.device.type, enabled=False):
             near = -torch.log1p(defocus)
             far = -torch.log1p(-defocus.clamp(max=0.97))
@@ -420,14 +427,16 @@ class CompactDepth(nn.Module):
             inputs = [near, far, defocus.clamp(max=3.0), torch.log(spread.clamp(1e-3, 10.0)) * 0.3]
             inputs += [_plane(p, defocus) for p in planes]
         *_, coarsest, x = self.unet(*features, torch.cat(inputs, 1))
-        near_logit = self.layout(coarsest)
+        layout_odds = self.layout(coarsest)
+        enlarged = functional.interpolate(layout_odds, scale_factor=self.times, mode="bilinear", align_corners=False)
         with torch.autocast(defocus.device.type, enabled=False):
             out = functional.conv2d(x.float(), self.head.weight, self.head.bias)
             free_near, free_far = functional.logsigmoid(-out[:, 0:1]), -functional.logsigmoid(-out[:, 1:2])
             gate = torch.sigmoid(out[:, 2:3])
             log_near = (gate * near + (1 - gate) * free_near).clamp(-RATIO_BOUND, 0.0)
             log_far = (gate * far + (1 - gate) * free_far).clamp(0.0, RATIO_BOUND)
-        return DepthEstimate(log_near, log_far, near_logit + out[:, 3:4], _bounded_log_error(out[:, 4:5]))
+        near_logit, log_scale = enlarged + out[:, 3:4], _bounded_log_error(out[:, 4:5])
+        return LaidOutEstimate(log_near, log_far, near_logit, log_scale, coarsest, layout_odds)
 
 
 class PaperBlur(nn.Module):

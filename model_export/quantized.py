@@ -5,6 +5,7 @@ Weights have seven bits (``reduce_range``), because AVX2 without integer dot pro
 
 import copy
 import logging
+import shutil
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
@@ -76,13 +77,19 @@ def through_cells(pair: Pair) -> Pair:
 
 
 def quantised_graphs(pair: Pair, folder: Path) -> Graphs:
-    """Write both graphs in int8, their ranges taken from generated scenes; what the manifest says of them."""
+    """Write both graphs in int8, their ranges taken from generated scenes; what the manifest says of all.
+
+    The layout's own graph, which large pictures alone need, and once, stays as it is.
+    """
     with tempfile.TemporaryDirectory() as scratch:
         graphs = export_graphs(through_cells(pair), Path(scratch))
         blur, depth = zip(*_scene_feeds(pair, graphs.feature_names), strict=True)
+        if graphs.layout:
+            shutil.copy(Path(scratch, graphs.layout.file), folder)
         return Graphs(
             blur=_quantised(graphs.blur, Path(scratch), list(blur), folder, in_float=(ENERGIES,)),
             depth=_quantised(graphs.depth, Path(scratch), list(depth), folder),
+            layout=graphs.layout,
         )
 
 

@@ -10,12 +10,13 @@ import torch
 from numpy.typing import NDArray
 
 from model_export.losses import correct
-from model_export.networks import Pair, Scene
+from model_export.networks import LaidOutEstimate, Pair, Scene
 from model_export.train import Checkpoint
-from service.inference.artifact import load_model_folder
+from service.inference.artifact import LAYOUT_MAP, LAYOUT_ODDS, load_model_folder
 
 SIZES = ((64, 64), (240, 320), (480, 640))
 TOLERANCE = 1e-3
+LEAST = 1e-6  # an untrained layout says nothing at all
 SEED = 7
 CAMERA = {"k_cam_px": 3.81, "gamma_px": 0.5, "focus_distance_m": 2.0, "focal_length_px": 550.0}
 
@@ -44,11 +45,20 @@ def verify_pair(pair: Pair, folder: Path) -> list[Difference]:
     for height, width in SIZES:
         image = _picture(height, width)
         expected, feeds = through_torch(pair, image, CAMERA, loaded.manifest.graphs.feature_names)
-        got = _run(blur, {"image": image}) | _run(depth, feeds)
-        for name, value in expected.items():
-            relative = float(np.abs(got[name] - value).max() / np.abs(value).max())
-            differences.append(Difference(height, width, name, relative))
+        told = _run(depth, feeds)
+        differences += _differences(expected, _run(blur, {"image": image}) | told, height, width)
+        if loaded.layout_graph is not None:
+            layout = onnxruntime.InferenceSession(loaded.layout_graph, options, providers=providers)
+            alone = {LAYOUT_ODDS: expected[LAYOUT_ODDS]}
+            differences += _differences(alone, _run(layout, told), height, width)
     return differences
+
+
+def _differences(expected: Arrays, got: Arrays, height: int, width: int) -> list[Difference]:
+    return [
+        Difference(height, width, name, float(np.abs(got[name] - value).max() / max(np.abs(value).max(), LEAST)))
+        for name, value in expected.items()
+    ]
 
 
 def _picture(height: int, width: int) -> NDArray[np.float32]:
@@ -88,6 +98,8 @@ def through_torch(
         "log_scale": told.log_scale.numpy(),
         **features,
     }
+    if isinstance(told, LaidOutEstimate):
+        expected |= {LAYOUT_MAP: told.layout_map.numpy(), LAYOUT_ODDS: told.layout_odds.numpy()}
     feeds = {
         "relative_defocus": x.numpy(),
         "relative_defocus_spread": spread.numpy(),

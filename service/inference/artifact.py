@@ -28,6 +28,7 @@ BLUR_INPUTS = frozenset({"image"})
 BLUR_OUTPUTS = frozenset({"blur_px", "blur_log_error"})
 DEPTH_INPUTS = frozenset({"relative_defocus", "relative_defocus_spread", "focus_distance_m", "focal_length_px", "side"})
 DEPTH_OUTPUTS = frozenset({"log_ratio_near", "log_ratio_far", "p_near", "log_scale"})
+LAYOUT_MAP, LAYOUT_ODDS = "layout_map", "layout_odds"
 
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -86,16 +87,23 @@ class GraphFile(_Part):
 class Graphs(_Part):
     """The pair. Features leave the blur graph and enter the depth graph under the same names.
 
-    A depth graph may leave out inputs that it has no use for, except ``relative_defocus``.
+    A depth graph may leave out inputs that it has no use for, except ``relative_defocus``. Where there is a ``layout``
+    graph it answers, for a map that is put together of several, what the depth graph does for its own.
     """
 
     blur: GraphFile
     depth: GraphFile
+    layout: GraphFile | None = None
 
     @property
     def feature_names(self) -> tuple[str, ...]:
         """What the depth graph takes from the blur graph."""
         return tuple(name for name in self.depth.input_names if name.startswith(FEATURES_PREFIX))
+
+    @property
+    def files(self) -> tuple[GraphFile, ...]:
+        """All there are."""
+        return (self.blur, self.depth) if self.layout is None else (self.blur, self.depth, self.layout)
 
     @model_validator(mode="after")
     def _fit_together(self) -> Self:
@@ -104,6 +112,10 @@ class Graphs(_Part):
         _require_names("blur graph's outputs", self.blur.output_names, BLUR_OUTPUTS | features)
         _require_names("depth graph's inputs", self.depth.input_names, {"relative_defocus"})
         _require_names("depth graph's outputs", self.depth.output_names, DEPTH_OUTPUTS)
+        if self.layout is not None:
+            _require_names("depth graph's outputs", self.depth.output_names, {LAYOUT_MAP, LAYOUT_ODDS})
+            _require_names("layout graph's inputs", self.layout.input_names, {LAYOUT_MAP})
+            _require_names("layout graph's outputs", self.layout.output_names, {LAYOUT_ODDS})
         if unknown := set(self.depth.input_names) - DEPTH_INPUTS - features:
             raise ValueError(f"the depth graph asks for {sorted(unknown)}, which nothing provides")
         return self
@@ -186,6 +198,11 @@ class ModelFolder:
     def depth_graph(self) -> Path:
         return self.path / self.manifest.graphs.depth.file
 
+    @property
+    def layout_graph(self) -> Path | None:
+        layout = self.manifest.graphs.layout
+        return self.path / layout.file if layout else None
+
     def card(self) -> str:
         """The model card, Markdown."""
         return (self.path / self.manifest.card.file).read_text(encoding="utf-8")
@@ -204,7 +221,7 @@ def load_model_folder(path: Path) -> ModelFolder:
     """
     folder = path.resolve()
     manifest = _read_manifest(folder / MANIFEST_FILE)
-    for part in (manifest.graphs.blur, manifest.graphs.depth, manifest.card):
+    for part in (*manifest.graphs.files, manifest.card):
         _verify(folder, part.file, part.sha256)
     return ModelFolder(folder, manifest)
 
@@ -214,7 +231,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> Path:
 
     Raises ``ModelFolderError`` where a file is missing or differs from what the manifest says of it.
     """
-    for part in (manifest.graphs.blur, manifest.graphs.depth, manifest.card):
+    for part in (*manifest.graphs.files, manifest.card):
         _verify(folder.resolve(), part.file, part.sha256)
     target = folder / MANIFEST_FILE
     draft = folder / f".{MANIFEST_FILE}.part"

@@ -105,27 +105,32 @@ class Estimator:
             raise ValueError(f"the camera must be that of a {width}x{height} image: resize it first")
         cancellation = cancellation or Cancellation()
         scale = self._base_scale(camera)
+        whole_px = max(width, height) * scale
         if part is None:
-            return self._estimate(rgb, camera, scale, side, cancellation)
+            return self._estimate(rgb, camera, scale, whole_px, side, cancellation)
         around = part.widened(round(SURROUNDINGS_PX / scale), self.manifest.multiple, width, height)
-        return self._estimate(around.of(rgb), around.behind(camera), scale, side, cancellation, part.within(around))
+        within = part.within(around)
+        return self._estimate(around.of(rgb), around.behind(camera), scale, whole_px, side, cancellation, within)
 
     def read(self, rgb: NDArray[np.uint8], camera: Camera, side: Side = "auto") -> Read:
         """What the networks answer, before it is decided what that means: for measuring them."""
-        return self._read_copies(rgb, _copied(camera, self._base_scale(camera)), side, Cancellation(), Stopwatch())
+        scale = self._base_scale(camera)
+        whole_px = max(camera.image_width_px, camera.image_height_px) * scale
+        return self._read_copies(rgb, _copied(camera, scale), whole_px, side, Cancellation(), Stopwatch())
 
     def _estimate(
         self,
         rgb: NDArray[np.uint8],
         camera: Camera,
         scale: float,
+        whole_px: float,
         side: Side,
         cancellation: Cancellation,
         part: Part | None = None,
     ) -> DepthMap:
         height, width = rgb.shape[:2]
         stopwatch = Stopwatch()
-        read = self._read_copies(rgb, _copied(camera, scale), side, cancellation, stopwatch)
+        read = self._read_copies(rgb, _copied(camera, scale), whole_px, side, cancellation, stopwatch)
         reading = Reading.of(read.maps, read.camera, (height, width), self.manifest, side, read.most_blur_px)
         if height * width > SMALL_PX:
             self._freeing.ask()  # what a large picture has taken is kept for the next one, but for a while only
@@ -162,10 +167,19 @@ class Estimator:
         return float((maps["blur_px"] > self._strong_px).mean()) > STRONG_FRACTION
 
     def _read_copies(
-        self, rgb: NDArray[np.uint8], working: Camera, side: Side, cancellation: Cancellation, stopwatch: Stopwatch
+        self,
+        rgb: NDArray[np.uint8],
+        working: Camera,
+        whole_px: float,
+        side: Side,
+        cancellation: Cancellation,
+        stopwatch: Stopwatch,
     ) -> Read:
-        """What a copy shows that is as large as that camera's pictures, and for strong blur one of half its size."""
-        maps = self._read_copy(rgb, working, side, cancellation, stopwatch)
+        """What a copy shows that is as large as that camera's pictures, and for strong blur one of half its size.
+
+        ``whole_px`` is the longer side of such a copy of all of the photograph, of which this may be a part.
+        """
+        maps = self._read_copy(rgb, working, whole_px, side, cancellation, stopwatch)
         most_blur_px = self.manifest.ranges.blur_px.high
         if not self._shows_strong_blur(maps, working):
             return Read(maps, working, (working.image_width_px,), most_blur_px)
@@ -173,24 +187,35 @@ class Estimator:
         ratio = Ratio.between(
             (working.image_height_px, working.image_width_px), (coarser.image_height_px, coarser.image_width_px), 1
         )
-        told = self._read_copy(rgb, coarser, side, cancellation, stopwatch)
+        told = self._read_copy(rgb, coarser, whole_px * COARSER, side, cancellation, stopwatch)
         with stopwatch.stage("correct"):
             blend(maps, told, ratio, self._strong_px)
         return Read(maps, working, (working.image_width_px, coarser.image_width_px), most_blur_px / COARSER)
 
     def _read_copy(
-        self, rgb: NDArray[np.uint8], working: Camera, side: Side, cancellation: Cancellation, stopwatch: Stopwatch
+        self,
+        rgb: NDArray[np.uint8],
+        working: Camera,
+        whole_px: float,
+        side: Side,
+        cancellation: Cancellation,
+        stopwatch: Stopwatch,
     ) -> RawMaps:
-        """The maps of a copy as large as that camera's pictures."""
+        """The maps of a copy as large as that camera's pictures; the layout is seen where all of it is not too wide."""
         size = (working.image_width_px, working.image_height_px)
         copy = rgb if size == rgb.shape[1::-1] else cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
-        return read_in_tiles(
+        is_wide = whole_px > WIDE_PX
+        read = self._pair.read_tile if is_wide else self._pair.read
+        maps = read_in_tiles(
             np.asarray(copy, np.uint8),
-            lambda tile: self._pair.read(tile, working, side, cancellation, stopwatch),
+            lambda tile: read(tile, working, side, cancellation, stopwatch),
             multiple=self.manifest.multiple,
             stride=self.manifest.stride,
             pixel_budget=self._pixel_budget,
         )
+        if is_wide:
+            self._pair.lay_out(maps, WIDE_PX / whole_px, cancellation, stopwatch)
+        return maps
 
     def _warnings(self, reading: Reading, *, whole: bool) -> list[str]:
         camera, scale, ranges = reading.camera, reading.scale, self.manifest.ranges

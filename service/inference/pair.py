@@ -13,8 +13,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from service.inference.artifact import Manifest, ModelFolder
+from service.inference.artifact import LAYOUT_MAP, LAYOUT_ODDS, Manifest, ModelFolder
 from service.inference.cancellation import Cancellation
+from service.inference.layout import add_odds, shrunk
 from service.inference.session import Graph
 from service.opencv import cv2
 from service.optics import thin_lens
@@ -48,13 +49,16 @@ class Stopwatch:
 
 
 class GraphPair:
-    """blur.onnx and depth.onnx, loaded; holds no state between calls."""
+    """blur.onnx and depth.onnx, and layout.onnx where there is one, loaded; holds no state between calls."""
 
     def __init__(self, folder: ModelFolder, intra_op_threads: int) -> None:
         graphs = folder.manifest.graphs
         self.manifest: Manifest = folder.manifest
         self._blur = Graph(folder.blur_graph, graphs.blur, intra_op_threads)
         self._depth = Graph(folder.depth_graph, graphs.depth, intra_op_threads)
+        self._layout = None
+        if graphs.layout and folder.layout_graph:
+            self._layout = Graph(folder.layout_graph, graphs.layout, intra_op_threads)
 
     def read(
         self,
@@ -68,6 +72,45 @@ class GraphPair:
 
         ``camera`` is at the scale of the image, of which this may be a part: a crop changes no blur.
         """
+        maps, _ = self._read(rgb, camera, side, cancellation, stopwatch)
+        return maps
+
+    def read_tile(
+        self,
+        rgb: NDArray[np.uint8],
+        camera: Camera,
+        side: Side,
+        cancellation: Cancellation,
+        stopwatch: Stopwatch,
+    ) -> RawMaps:
+        """As ``read`` does, but ``p_near`` is without what a tile's layout says, for which its map [c,h,w] is there."""
+        maps, told = self._read(rgb, camera, side, cancellation, stopwatch)
+        if self._layout is not None:
+            with stopwatch.stage("correct"):
+                add_odds(maps["p_near"], -told[LAYOUT_ODDS][0, 0], told["p_near"].shape[2:])
+                maps[LAYOUT_MAP] = told[LAYOUT_MAP][0]
+        return maps
+
+    def lay_out(self, maps: RawMaps, times: float, cancellation: Cancellation, stopwatch: Stopwatch) -> None:
+        """Add to ``p_near`` what the layout of all tiles says, seen so many times as large; its map is taken away."""
+        layout_map = maps.pop(LAYOUT_MAP, None)
+        if self._layout is None or layout_map is None:
+            return
+        with stopwatch.stage("depth"):
+            told = self._layout.run({LAYOUT_MAP: shrunk(layout_map, times)[np.newaxis]}, cancellation)
+        with stopwatch.stage("correct"):
+            height, width = (cells * self.manifest.multiple // self.manifest.stride for cells in layout_map.shape[1:])
+            add_odds(maps["p_near"], told[LAYOUT_ODDS][0, 0], (height, width))
+
+    def _read(
+        self,
+        rgb: NDArray[np.uint8],
+        camera: Camera,
+        side: Side,
+        cancellation: Cancellation,
+        stopwatch: Stopwatch,
+    ) -> tuple[RawMaps, RawMaps]:
+        """The raw maps, cut to the image, and all that the depth graph answers."""
         with stopwatch.stage("blur"):
             seen = self.see(rgb, cancellation)
         with stopwatch.stage("correct"):
@@ -75,7 +118,7 @@ class GraphPair:
         with stopwatch.stage("depth"):
             told = self._depth.run(feeds, cancellation)
         rows, columns = (-(-size // self.manifest.stride) for size in rgb.shape[:2])
-        return {name: (seen | told)[name][0, 0, :rows, :columns] for name in MAPS}
+        return {name: (seen | told)[name][0, 0, :rows, :columns] for name in MAPS}, told
 
     def free_memory(self) -> None:
         """Give back what large pictures have taken, through a run on a tiny one."""

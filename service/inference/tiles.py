@@ -30,19 +30,26 @@ def read_in_tiles(
 ) -> Maps:
     """What ``read`` gives for an image uint8 [h, w, 3]: at once, or from tiles faded into each other.
 
-    ``read`` maps uint8 [h, w, 3] to maps [ceil(h/stride), ceil(w/stride)]. Tiles start at multiples of
-    ``multiple``, so that a tile's grid is the photograph's.
+    ``read`` maps uint8 [h, w, 3] to maps [ceil(h/stride), ceil(w/stride)], or coarse ones with channels
+    [c, ceil(h/multiple), ceil(w/multiple)]. Tiles start at multiples of ``multiple``, so that a tile's grid is the
+    photograph's.
     """
     height, width = rgb.shape[:2]
     if height * width <= pixel_budget:
         return read(rgb)
     rows, columns = layout(height, width, multiple, pixel_budget)
-    merged = _Merge(-(-height // stride), -(-width // stride))
-    for row, fade_row in zip(rows, fades(rows, stride), strict=True):
-        for column, fade_column in zip(columns, fades(columns, stride), strict=True):
-            maps = read(rgb[row.start : row.stop, column.start : column.stop])
-            merged.add(maps, row.start // stride, column.start // stride, np.outer(fade_row, fade_column))
-    return merged.maps
+    merged: Maps = {}
+    weights = {step: [fades(along, step) for along in (rows, columns)] for step in (stride, multiple)}
+    for down, row in enumerate(rows):
+        for across, column in enumerate(columns):
+            for name, values in read(rgb[row.start : row.stop, column.start : column.stop]).items():
+                step = stride if values.ndim == 2 else multiple
+                size = (*values.shape[:-2], -(-height // step), -(-width // step))
+                weight = np.outer(weights[step][0][down], weights[step][1][across])
+                into = merged.setdefault(name, np.zeros(size, np.float32))
+                top, left = row.start // step, column.start // step
+                into[..., top : top + values.shape[-2], left : left + values.shape[-1]] += values * weight
+    return merged
 
 
 def layout(height: int, width: int, multiple: int, pixel_budget: int) -> tuple[list[Span], list[Span]]:
@@ -99,16 +106,3 @@ def _soft_step(t: NDArray[np.float64]) -> NDArray[np.float64]:
     """From 0 at 0 to 1 at 1, level at both: a tile's edge, where it knows least of what surrounds it, counts least."""
     t = np.clip(t, 0, 1)
     return t * t * (3 - 2 * t)
-
-
-class _Merge:
-    """A weighted sum of tiles, map by map; the weights sum to 1 everywhere."""
-
-    def __init__(self, rows: int, columns: int) -> None:
-        self._shape = (rows, columns)
-        self.maps: Maps = {}
-
-    def add(self, maps: Maps, row: int, column: int, weight: NDArray[np.float32]) -> None:
-        for name, values in maps.items():
-            target = self.maps.setdefault(name, np.zeros(self._shape, np.float32))
-            target[row : row + values.shape[0], column : column + values.shape[1]] += values * weight

@@ -10,7 +10,7 @@ from model_export import quantized
 from model_export.card import record_scores
 from model_export.config import Kind, TrainConfig
 from model_export.export import export_pair
-from model_export.networks import Pair, make_pair
+from model_export.networks import CompactDepth, Pair, make_pair
 from model_export.verify import SIZES, TOLERANCE, verify_pair
 from service.config import INT8, SHIPPED_MODEL
 from service.inference.artifact import load_model_folder
@@ -26,6 +26,8 @@ def untrained(kind: Kind) -> Pair:
         if isinstance(module, torch.nn.BatchNorm2d):  # as training leaves them: neither 0 nor 1
             module.get_buffer("running_mean").uniform_(-0.1, 0.1)
             module.get_buffer("running_var").uniform_(0.5, 1.5)
+    if isinstance(pair.depth, CompactDepth):
+        torch.nn.init.normal_(pair.depth.layout.head.weight)
     return pair
 
 
