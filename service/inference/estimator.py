@@ -26,9 +26,10 @@ WELL_READ_K_CAM_PX = 12.0
 # of a picture larger than this the network sees too little at a time, and reads it as well where k_cam is this:
 WIDE_PX, FINE_K_CAM_PX = 640, 5.0
 # what is as blurred as this part of the most that the model was trained on is read better on a copy of half the size,
-# where it is half as blurred and more of its surroundings is seen: table tops by k_cam 2.64 to 10.7 px to 0.126, 0.125,
-# 0.122, 0.122 m for 0.137, 0.140, 0.139, 0.156, indoor frames as before
-STRONG_BLUR = 0.2
+# where it is half as blurred and more of its surroundings is seen, and so on: table tops by k_cam 2.64 to 10.7 px
+# 0.105, 0.117, 0.108, 0.110 m, with one such copy, from a fifth on, 0.110, 0.127, 0.104, 0.138, indoor frames alike
+STRONG_BLUR = 0.175
+SMALLER_COPIES = 2
 STRONG_FRACTION = 1e-3  # of the picture: a few cells' noise is not worth the time, and in them alone a part may differ
 COARSER = 0.5
 # how much around a part is read with it: such a copy sees twice as far as a tile of the picture. Of parts of 1920x1440
@@ -71,11 +72,6 @@ class Estimator:
     @property
     def manifest(self) -> Manifest:
         return self._pair.manifest
-
-    @property
-    def _strong_px(self) -> float:
-        """Blur that a copy of half the size shows better, in pixels of the larger one."""
-        return STRONG_BLUR * self.manifest.ranges.blur_px.high
 
     def warm_up(self) -> None:
         """Answer one small grey picture, so that the first request does not pay for preparing the graphs."""
@@ -159,13 +155,6 @@ class Estimator:
         longer_px = max(camera.image_width_px, camera.image_height_px)
         return min(1.0, at_most, max(WIDE_PX / longer_px, FINE_K_CAM_PX / camera.k_cam_px))
 
-    def _shows_strong_blur(self, maps: RawMaps, camera: Camera) -> bool:
-        """Whether what a copy shows is read better, in parts, on one of half its size that the model knows too."""
-        ranges = self.manifest.ranges
-        if camera.k_cam_px * COARSER < ranges.k_cam_px.low:
-            return False
-        return float((maps["blur_px"] > self._strong_px).mean()) > STRONG_FRACTION
-
     def _read_copies(
         self,
         rgb: NDArray[np.uint8],
@@ -174,23 +163,25 @@ class Estimator:
         side: Side,
         cancellation: Cancellation,
         stopwatch: Stopwatch,
+        smaller: int = SMALLER_COPIES,
     ) -> Read:
-        """What a copy shows that is as large as that camera's pictures, and for strong blur one of half its size.
+        """What a copy shows that is as large as that camera's pictures, and for strong blur up to so many smaller ones.
 
         ``whole_px`` is the longer side of such a copy of all of the photograph, of which this may be a part.
         """
         maps = self._read_copy(rgb, working, whole_px, side, cancellation, stopwatch)
-        most_blur_px = self.manifest.ranges.blur_px.high
-        if not self._shows_strong_blur(maps, working):
+        most_blur_px, coarser = self.manifest.ranges.blur_px.high, _copied(working, COARSER)
+        strong_px = STRONG_BLUR * most_blur_px
+        is_read_better = smaller > 0 and coarser.k_cam_px >= self.manifest.ranges.k_cam_px.low
+        if not is_read_better or float((maps["blur_px"] > strong_px).mean()) <= STRONG_FRACTION:
             return Read(maps, working, (working.image_width_px,), most_blur_px)
-        coarser = _copied(working, COARSER)
         ratio = Ratio.between(
             (working.image_height_px, working.image_width_px), (coarser.image_height_px, coarser.image_width_px), 1
         )
-        told = self._read_copy(rgb, coarser, whole_px * COARSER, side, cancellation, stopwatch)
+        told = self._read_copies(rgb, coarser, whole_px * COARSER, side, cancellation, stopwatch, smaller - 1)
         with stopwatch.stage("correct"):
-            blend(maps, told, ratio, self._strong_px)
-        return Read(maps, working, (working.image_width_px, coarser.image_width_px), most_blur_px / COARSER)
+            blend(maps, told.maps, ratio, strong_px)
+        return Read(maps, working, (working.image_width_px, *told.widths_px), told.most_blur_px / COARSER)
 
     def _read_copy(
         self,
