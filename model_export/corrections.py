@@ -32,8 +32,6 @@ def temperature(pixels: Pixels) -> float:
 def calibrate(model: Path) -> tuple[float, float]:
     """Find both for a model folder and write them into its manifest: ``blur_gain`` and ``temperature``.
 
-    The temperature is never below 1: with the side told, errors on other pictures were 0.69 (a real lens), 0.86 to 1.09
-    (refocused frames and table tops) and 1.02 times (ray-traced rooms) those stated.
     The side is told: being on the wrong side of focus is what the other hypothesis is for. Raises ``ValueError`` for a
     model that no gain or no temperature in bounds makes right.
     """
@@ -43,12 +41,12 @@ def calibrate(model: Path) -> tuple[float, float]:
     gain = _told(model, "blur_gain", blur_gain(Pixels.joined([blur for blur in seen if blur is not None])))
     examiner = Examiner(model)
     found = temperature(Pixels.joined([examiner.told(case, case.camera.k_cam_px)[0].depth for case in cases]))
-    return gain, _told(model, "temperature", found, at_least=1.0)
+    return gain, _told(model, "temperature", found)
 
 
-def _told(model: Path, name: str, factor: float, at_least: float = 0.0) -> float:
+def _told(model: Path, name: str, factor: float) -> float:
     """Multiply a number of a folder's manifest, which answers were made with, by what they lack; what it is now."""
     before = load_model_folder(model).manifest
-    now = round(max(at_least, float(getattr(before, name)) * factor), DECIMALS)
+    now = round(float(getattr(before, name)) * factor, DECIMALS)
     write_manifest(model, Manifest.model_validate(before.model_dump() | {name: now}))
     return now

@@ -1,12 +1,14 @@
 """The model folder: what the manifest does not vouch for is refused, by name."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from service.inference.artifact import ModelFolderError, load_model_folder, write_manifest
+from service.config import SHIPPED_MODEL
+from service.inference.artifact import LAYOUT_MAP, ModelFolderError, load_model_folder, write_manifest
 from tests.inference.oracle_pair import BLUR_RANGE, build_oracle_pair
 
 
@@ -89,3 +91,24 @@ def test_graphs_that_do_not_fit_are_refused(folder: Path) -> None:
     edit(folder, manifest)
     with pytest.raises(ModelFolderError, match="features_red"):
         load_model_folder(folder)
+
+
+@pytest.fixture
+def with_layout(tmp_path: Path) -> Path:
+    return Path(shutil.copytree(SHIPPED_MODEL, tmp_path / "shipped"))
+
+
+def test_an_altered_layout_is_refused_by_name(with_layout: Path) -> None:
+    with (with_layout / "layout.onnx").open("ab") as stream:
+        stream.write(b" ")
+    with pytest.raises(ModelFolderError, match=r"layout\.onnx is not the file"):
+        load_model_folder(with_layout)
+
+
+def test_a_layout_without_a_map_to_see_is_refused(with_layout: Path) -> None:
+    manifest = json.loads((with_layout / "manifest.json").read_text())
+    outputs = manifest["graphs"]["depth"]["outputs"]
+    manifest["graphs"]["depth"]["outputs"] = [output for output in outputs if output["name"] != LAYOUT_MAP]
+    edit(with_layout, manifest)
+    with pytest.raises(ModelFolderError, match=LAYOUT_MAP):
+        load_model_folder(with_layout)

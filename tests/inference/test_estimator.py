@@ -203,20 +203,22 @@ def test_a_small_copy_keeps_the_place_of_things(estimator: Estimator) -> None:
 
 @pytest.fixture(scope="module")
 def halving(tmp_path_factory: pytest.TempPathFactory) -> Estimator:
-    """It knows blur to 20 px, so that of 4 px and more is read on a copy of half the size."""
+    """It knows blur to 20 px, so that of 3.5 px and more is read on a copy of half the size, and there alike."""
     folder = build_oracle_pair(tmp_path_factory.mktemp("model"), blur_range=Interval(0.3, 20.0))
     return Estimator.from_folder(load_model_folder(folder))
 
 
 @pytest.mark.parametrize("size", [(64, 96), (63, 101), (50, 203)])
-def test_strong_blur_is_read_on_a_copy_of_half_the_size(halving: Estimator, size: tuple[int, int]) -> None:
+def test_strong_blur_is_read_on_smaller_copies(halving: Estimator, size: tuple[int, int]) -> None:
     height, width = size
     rgb = grey(brightness_for(1.8), height, width)
     rgb[:, width // 2 :] = brightness_for(8.0)
     camera = replace(CAMERA, image_width_px=width, image_height_px=height)
     answer = halving.estimate(rgb, camera, "near")
-    assert answer.scales == pytest.approx((1, 0.5), rel=0.02)
-    copied = camera.averaged(round(width * 0.5), round(height * 0.5))
+    assert answer.scales == pytest.approx((1, 0.5, 0.25), rel=0.02)
+    copied = camera
+    for _ in range(2):
+        copied = copied.averaged(round(copied.image_width_px * 0.5), round(copied.image_height_px * 0.5))
     for columns, told, seen_by in (
         (slice(0, width // 2 - 6), 1.8, camera),
         (slice(width // 2 + 6, width), 8.0, copied),
@@ -231,18 +233,21 @@ def test_between_two_copies_no_step_shows(halving: Estimator) -> None:
     ramp = np.linspace(brightness_for(1.0), brightness_for(6.0), 640).round().astype(np.uint8)
     rgb = np.repeat(np.repeat(ramp[np.newaxis, :, np.newaxis], 64, axis=0), 3, axis=2)
     answer = halving.estimate(rgb, replace(CAMERA, image_width_px=640), "near")
-    assert answer.scales == (1, 0.5)
-    steps = np.diff(np.log(answer.blur_px[32, 8:-8]))
+    assert answer.scales == (1, 0.5, 0.25)
+    steps = np.diff(np.log(answer.blur_px[32, 16:-16]))
     assert steps.min() >= 0
-    assert steps.max() < 0.05  # the oracle reads a copy twice as blurred: a step would be ln 2
+    assert steps.max() < 0.1  # the oracle reads each copy twice as blurred: a step would be ln 2
 
 
-@pytest.mark.parametrize(("blur_px", "k_cam_px"), [(3.9, 6.0), (8.0, 0.9)])
-def test_one_copy_is_read_where_no_blur_is_strong_or_the_model_knows_no_k_cam_of_half(
-    halving: Estimator, blur_px: float, k_cam_px: float
+@pytest.mark.parametrize(
+    ("blur_px", "k_cam_px", "scales"),
+    [(3.4, 6.0, (1,)), (8.0, 0.9, (1,)), (8.0, 1.9, (1, 0.5)), (8.0, 2.1, (1, 0.5, 0.25))],
+)
+def test_no_more_copies_are_read_where_no_blur_is_strong_or_the_model_knows_no_such_k_cam(
+    halving: Estimator, blur_px: float, k_cam_px: float, scales: tuple[float, ...]
 ) -> None:
     picture = grey(brightness_for(blur_px))
-    assert halving.estimate(picture, replace(CAMERA, k_cam_px=k_cam_px), "near").scales == (1,)
+    assert halving.estimate(picture, replace(CAMERA, k_cam_px=k_cam_px), "near").scales == scales
 
 
 def test_a_few_cells_of_strong_blur_are_not_worth_a_second_copy(halving: Estimator) -> None:
@@ -250,7 +255,7 @@ def test_a_few_cells_of_strong_blur_are_not_worth_a_second_copy(halving: Estimat
     picture[20:22, 40:42] = brightness_for(8.0)
     assert halving.estimate(picture, CAMERA, "near").scales == (1,)
     picture[20:24, 40:44] = brightness_for(8.0)
-    assert halving.estimate(picture, CAMERA, "near").scales == (1, 0.5)
+    assert halving.estimate(picture, CAMERA, "near").scales == (1, 0.5, 0.25)
 
 
 def test_what_lies_outside_the_trained_ranges_is_said(estimator: Estimator) -> None:
