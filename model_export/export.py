@@ -109,7 +109,8 @@ def export_graphs(pair: Pair, folder: Path) -> Graphs:
     numbers = [torch.ones(2), torch.full((2,), 500.0), torch.zeros(2)]
     inputs = (torch.rand(cells) + 0.1, torch.rand(cells) + 0.1, *numbers, seen.features)
     blur = _write(_BlurGraph(pair.blur), (image,), ("image",), BLUR_OUTPUTS + names, folder / "blur.onnx")
-    outputs, layout = DEPTH_OUTPUTS, None
+    outputs: tuple[str, ...] = DEPTH_OUTPUTS
+    layout = None
     if isinstance(pair.depth, CompactDepth):
         outputs += LAYOUT_INPUTS + LAYOUT_OUTPUTS
         layout_map = torch.rand(2, pair.depth.coarsest, height // MULTIPLE, width // MULTIPLE)

@@ -100,11 +100,6 @@ class Graphs(_Part):
         """What the depth graph takes from the blur graph."""
         return tuple(name for name in self.depth.input_names if name.startswith(FEATURES_PREFIX))
 
-    @property
-    def files(self) -> tuple[GraphFile, ...]:
-        """All there are."""
-        return (self.blur, self.depth) if self.layout is None else (self.blur, self.depth, self.layout)
-
     @model_validator(mode="after")
     def _fit_together(self) -> Self:
         features = frozenset(self.feature_names)
@@ -176,6 +171,12 @@ class Manifest(_Part):
     training: Training
     card: CardFile
 
+    @property
+    def files(self) -> list[GraphFile | CardFile]:
+        """All that it vouches for."""
+        graphs = (self.graphs.blur, self.graphs.depth, self.graphs.layout)
+        return [*(graph for graph in graphs if graph is not None), self.card]
+
     @model_validator(mode="after")
     def _stride_divides_multiple(self) -> Self:
         if self.multiple % self.stride:
@@ -221,7 +222,7 @@ def load_model_folder(path: Path) -> ModelFolder:
     """
     folder = path.resolve()
     manifest = _read_manifest(folder / MANIFEST_FILE)
-    for part in (*manifest.graphs.files, manifest.card):
+    for part in manifest.files:
         _verify(folder, part.file, part.sha256)
     return ModelFolder(folder, manifest)
 
@@ -231,7 +232,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> Path:
 
     Raises ``ModelFolderError`` where a file is missing or differs from what the manifest says of it.
     """
-    for part in (*manifest.graphs.files, manifest.card):
+    for part in manifest.files:
         _verify(folder.resolve(), part.file, part.sha256)
     target = folder / MANIFEST_FILE
     draft = folder / f".{MANIFEST_FILE}.part"

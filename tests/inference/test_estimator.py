@@ -220,8 +220,8 @@ def test_strong_blur_is_read_on_smaller_copies(halving: Estimator, size: tuple[i
     for _ in range(2):
         copied = copied.averaged(round(copied.image_width_px * 0.5), round(copied.image_height_px * 0.5))
     for columns, told, seen_by in (
-        (slice(0, width // 2 - 6), 1.8, camera),
-        (slice(width // 2 + 6, width), 8.0, copied),
+        (slice(0, width // 2 - 14), 1.8, camera),
+        (slice(width // 2 + 14, width), 8.0, copied),
     ):
         blur_px = blur_of(brightness_for(told))
         np.testing.assert_allclose(answer.blur_px[:, columns], blur_px * width / seen_by.image_width_px, rtol=1e-4)
