@@ -196,10 +196,9 @@ class Estimator:
         size = (working.image_width_px, working.image_height_px)
         copy = rgb if size == rgb.shape[1::-1] else cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
         is_wide = whole_px > WIDE_PX
-        read = self._pair.read_tile if is_wide else self._pair.read
         maps = read_in_tiles(
             np.asarray(copy, np.uint8),
-            lambda tile: read(tile, working, side, cancellation, stopwatch),
+            lambda tile: self._pair.read(tile, working, side, cancellation, stopwatch, is_tile=is_wide),
             multiple=self.manifest.multiple,
             stride=self.manifest.stride,
             pixel_budget=self._pixel_budget,

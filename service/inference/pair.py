@@ -67,28 +67,26 @@ class GraphPair:
         side: Side,
         cancellation: Cancellation,
         stopwatch: Stopwatch,
+        *,
+        is_tile: bool = False,
     ) -> RawMaps:
         """Raw maps, each float32 [ceil(h/stride), ceil(w/stride)], of an image uint8 [h, w, 3].
 
-        ``camera`` is at the scale of the image, of which this may be a part: a crop changes no blur.
+        ``camera`` is at the scale of the image, of which this may be a part: a crop changes no blur. Of a tile
+        ``p_near`` is without what its own layout says: ``lay_out`` adds the whole's, of the map [c,h,w] that is there.
         """
-        maps, _ = self._read(rgb, camera, side, cancellation, stopwatch)
-        return maps
-
-    def read_tile(
-        self,
-        rgb: NDArray[np.uint8],
-        camera: Camera,
-        side: Side,
-        cancellation: Cancellation,
-        stopwatch: Stopwatch,
-    ) -> RawMaps:
-        """As ``read`` does, but ``p_near`` is without what a tile's layout says, for which its map [c,h,w] is there."""
-        maps, told = self._read(rgb, camera, side, cancellation, stopwatch)
-        if self._layout is not None:
+        with stopwatch.stage("blur"):
+            seen = self.see(rgb, cancellation)
+        with stopwatch.stage("correct"):
+            feeds = _corrected(seen, camera, side)
+        with stopwatch.stage("depth"):
+            told = self._depth.run(feeds, cancellation)
+        rows, columns = (-(-size // self.manifest.stride) for size in rgb.shape[:2])
+        maps = {name: (seen | told)[name][0, 0, :rows, :columns] for name in MAPS}
+        if is_tile and self._layout is not None:
             with stopwatch.stage("correct"):
                 add_odds(maps["p_near"], -told[LAYOUT_ODDS][0, 0], told["p_near"].shape[2:])
-                maps[LAYOUT_MAP] = told[LAYOUT_MAP][0]
+            maps[LAYOUT_MAP] = told[LAYOUT_MAP][0]
         return maps
 
     def lay_out(self, maps: RawMaps, times: float, cancellation: Cancellation, stopwatch: Stopwatch) -> None:
@@ -101,24 +99,6 @@ class GraphPair:
         with stopwatch.stage("correct"):
             height, width = (cells * self.manifest.multiple // self.manifest.stride for cells in layout_map.shape[1:])
             add_odds(maps["p_near"], told[LAYOUT_ODDS][0, 0], (height, width))
-
-    def _read(
-        self,
-        rgb: NDArray[np.uint8],
-        camera: Camera,
-        side: Side,
-        cancellation: Cancellation,
-        stopwatch: Stopwatch,
-    ) -> tuple[RawMaps, RawMaps]:
-        """The raw maps, cut to the image, and all that the depth graph answers."""
-        with stopwatch.stage("blur"):
-            seen = self.see(rgb, cancellation)
-        with stopwatch.stage("correct"):
-            feeds = _corrected(seen, camera, side)
-        with stopwatch.stage("depth"):
-            told = self._depth.run(feeds, cancellation)
-        rows, columns = (-(-size // self.manifest.stride) for size in rgb.shape[:2])
-        return {name: (seen | told)[name][0, 0, :rows, :columns] for name in MAPS}, told
 
     def free_memory(self) -> None:
         """Give back what large pictures have taken, through a run on a tiny one."""

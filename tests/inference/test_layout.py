@@ -44,16 +44,16 @@ def test_a_smaller_map_has_the_means_of_what_its_cells_cover() -> None:
     assert shrunk(layout_map, 0.01).shape == (3, 1, 1)
 
 
-def reading(read: Callable[..., RawMaps], width: int, height: int) -> Callable[[NDArray[np.uint8]], RawMaps]:
+def reading(pair: GraphPair, width: int, height: int, *, is_tile: bool) -> Callable[[NDArray[np.uint8]], RawMaps]:
     """What reads any part of a picture of that size."""
     camera = camera_for(width, height)
-    return lambda part: read(part, camera, "auto", Cancellation(), Stopwatch())
+    return lambda part: pair.read(part, camera, "auto", Cancellation(), Stopwatch(), is_tile=is_tile)
 
 
 def test_a_layout_taken_away_and_seen_again_at_its_size_changes_nothing(pair: GraphPair) -> None:
     width, height = 330, 250
     picture = draw_picture(width, height)
-    expected, maps = (reading(read, width, height)(picture) for read in (pair.read, pair.read_tile))
+    expected, maps = (reading(pair, width, height, is_tile=is_tile)(picture) for is_tile in (False, True))
     assert np.abs(maps["p_near"] - expected["p_near"]).max() > 0.01
     pair.lay_out(maps, 1.0, Cancellation(), Stopwatch())
     np.testing.assert_allclose(maps["p_near"], expected["p_near"], atol=1e-3)
@@ -64,13 +64,15 @@ def test_tiles_with_the_layout_of_the_whole_tell_sides_as_the_whole_does(pair: G
     width, height = 1600, 1200
     picture = draw_picture(width, height)
 
-    def near(read: Callable[..., RawMaps], budget: int) -> NDArray[np.bool_]:
-        maps = read_in_tiles(picture, reading(read, width, height), multiple=16, stride=2, pixel_budget=budget)
+    def near(budget: int, *, is_tile: bool) -> NDArray[np.bool_]:
+        read = reading(pair, width, height, is_tile=is_tile)
+        maps = read_in_tiles(picture, read, multiple=16, stride=2, pixel_budget=budget)
         assert LAYOUT_MAP not in maps or maps[LAYOUT_MAP].shape == (48, 75, 100)
         pair.lay_out(maps, 640 / width, Cancellation(), Stopwatch())
         return maps["p_near"] > 0.5
 
     each_its_own, of_the_whole = (
-        float((near(read, width * height) != near(read, 1_250_000)).mean()) for read in (pair.read, pair.read_tile)
+        float((near(width * height, is_tile=is_tile) != near(1_250_000, is_tile=is_tile)).mean())
+        for is_tile in (False, True)
     )
     assert of_the_whole < 0.7 * each_its_own
