@@ -27,6 +27,8 @@ from model_export.networks import (
 )
 from model_export.train import Checkpoint
 from service.inference.artifact import (
+    LAYOUT_MAP,
+    LAYOUT_ODDS,
     CardFile,
     GraphFile,
     Graphs,
@@ -90,7 +92,7 @@ class _LayoutGraph(nn.Module):
 BLUR_OUTPUTS = ("blur_px", "blur_log_error")
 DEPTH_INPUTS = ("relative_defocus", "relative_defocus_spread", "focus_distance_m", "focal_length_px", "side")
 DEPTH_OUTPUTS = ("log_ratio_near", "log_ratio_far", "p_near", "log_scale")
-LAYOUT_INPUTS, LAYOUT_OUTPUTS = ("layout_map",), ("layout_odds",)
+LAYOUT_INPUTS, LAYOUT_OUTPUTS = (LAYOUT_MAP,), (LAYOUT_ODDS,)
 
 
 def feature_names(count: int) -> tuple[str, ...]:

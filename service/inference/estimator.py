@@ -2,7 +2,7 @@
 
 import weakref
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
@@ -40,6 +40,15 @@ FEW_ANSWERS = 0.5
 SMALL_PX = 600_000
 KEPT_S = 10.0
 WARM_UP_PX = 64
+
+
+@dataclass(frozen=True, slots=True)
+class _Request:
+    """What all copies and tiles of one photograph are read with."""
+
+    side: Side = "auto"
+    cancellation: Cancellation = field(default_factory=Cancellation)
+    stopwatch: Stopwatch = field(default_factory=Stopwatch)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,20 +108,20 @@ class Estimator:
         height, width = rgb.shape[:2]
         if (width, height) != (camera.image_width_px, camera.image_height_px):
             raise ValueError(f"the camera must be that of a {width}x{height} image: resize it first")
-        cancellation = cancellation or Cancellation()
+        request = _Request(side, cancellation or Cancellation())
         scale = self._base_scale(camera)
         whole_px = max(width, height) * scale
         if part is None:
-            return self._estimate(rgb, camera, scale, whole_px, side, cancellation)
+            return self._estimate(rgb, camera, scale, whole_px, request)
         around = part.widened(round(SURROUNDINGS_PX / scale), self.manifest.multiple, width, height)
         within = part.within(around)
-        return self._estimate(around.of(rgb), around.behind(camera), scale, whole_px, side, cancellation, within)
+        return self._estimate(around.of(rgb), around.behind(camera), scale, whole_px, request, within)
 
     def read(self, rgb: NDArray[np.uint8], camera: Camera, side: Side = "auto") -> Read:
         """What the networks answer, before it is decided what that means: for measuring them."""
         scale = self._base_scale(camera)
         whole_px = max(camera.image_width_px, camera.image_height_px) * scale
-        return self._read_copies(rgb, _copied(camera, scale), whole_px, side, Cancellation(), Stopwatch())
+        return self._read_copies(rgb, _copied(camera, scale), whole_px, _Request(side))
 
     def _estimate(
         self,
@@ -120,17 +129,16 @@ class Estimator:
         camera: Camera,
         scale: float,
         whole_px: float,
-        side: Side,
-        cancellation: Cancellation,
+        request: _Request,
         part: Part | None = None,
     ) -> DepthMap:
         height, width = rgb.shape[:2]
-        stopwatch = Stopwatch()
-        read = self._read_copies(rgb, _copied(camera, scale), whole_px, side, cancellation, stopwatch)
-        reading = Reading.of(read.maps, read.camera, (height, width), self.manifest, side, read.most_blur_px)
+        stopwatch = request.stopwatch
+        read = self._read_copies(rgb, _copied(camera, scale), whole_px, request)
+        reading = Reading.of(read.maps, read.camera, (height, width), self.manifest, request.side, read.most_blur_px)
         if height * width > SMALL_PX:
             self._freeing.ask()  # what a large picture has taken is kept for the next one, but for a while only
-        cancellation.check()
+        request.cancellation.check()
         with stopwatch.stage("encode"):
             depth_m, valid = decide(reading, (height, width))
         answer = DepthMap(
@@ -160,16 +168,14 @@ class Estimator:
         rgb: NDArray[np.uint8],
         working: Camera,
         whole_px: float,
-        side: Side,
-        cancellation: Cancellation,
-        stopwatch: Stopwatch,
+        request: _Request,
         smaller: int = SMALLER_COPIES,
     ) -> Read:
         """What a copy shows that is as large as that camera's pictures, and for strong blur up to so many smaller ones.
 
         ``whole_px`` is the longer side of such a copy of all of the photograph, of which this may be a part.
         """
-        maps = self._read_copy(rgb, working, whole_px, side, cancellation, stopwatch)
+        maps = self._read_copy(rgb, working, whole_px, request)
         most_blur_px, coarser = self.manifest.ranges.blur_px.high, _copied(working, COARSER)
         strong_px = STRONG_BLUR * most_blur_px
         is_read_better = smaller > 0 and coarser.k_cam_px >= self.manifest.ranges.k_cam_px.low
@@ -178,24 +184,17 @@ class Estimator:
         ratio = Ratio.between(
             (working.image_height_px, working.image_width_px), (coarser.image_height_px, coarser.image_width_px), 1
         )
-        told = self._read_copies(rgb, coarser, whole_px * COARSER, side, cancellation, stopwatch, smaller - 1)
-        with stopwatch.stage("correct"):
+        told = self._read_copies(rgb, coarser, whole_px * COARSER, request, smaller - 1)
+        with request.stopwatch.stage("correct"):
             blend(maps, told.maps, ratio, strong_px)
         return Read(maps, working, (working.image_width_px, *told.widths_px), told.most_blur_px / COARSER)
 
-    def _read_copy(
-        self,
-        rgb: NDArray[np.uint8],
-        working: Camera,
-        whole_px: float,
-        side: Side,
-        cancellation: Cancellation,
-        stopwatch: Stopwatch,
-    ) -> RawMaps:
+    def _read_copy(self, rgb: NDArray[np.uint8], working: Camera, whole_px: float, request: _Request) -> RawMaps:
         """The maps of a copy as large as that camera's pictures; the layout is seen where all of it is not too wide."""
         size = (working.image_width_px, working.image_height_px)
         copy = rgb if size == rgb.shape[1::-1] else cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
         is_wide = whole_px > WIDE_PX
+        side, cancellation, stopwatch = request.side, request.cancellation, request.stopwatch
         maps = read_in_tiles(
             np.asarray(copy, np.uint8),
             lambda tile: self._pair.read(tile, working, side, cancellation, stopwatch, is_tile=is_wide),
