@@ -1,24 +1,22 @@
 """How right a calibration is: simulated cameras with known constants, and the paper's own protocol for both methods."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from model_export.grids import GRID, GridCamera, draw_camera, draw_pose, photograph
+from model_export.grids import GRID, GridCamera, draw_camera, draw_pose, photograph, picture, sweep
 from model_export.render import DISC
-from service.calibration.calibrate import Picture, Task, calibrate
+from service.calibration.calibrate import Task, calibrate
 from service.calibration.fit import Interval
-from service.calibration.report import Method, Report, Role
+from service.calibration.report import Method, Report
 from service.calibration.target import CircleGrid
 from service.optics import thin_lens
 from service.optics.camera import Intrinsics
 
-NEAREST, FARTHEST = 0.6, 1.8  # of the focus distance
-MOST_BLUR = 1 / 3  # of a circle's radius
 PHOTOGRAPHS = (8, 12)
 # Fig. 4 of the paper: its k_cam counts k_r = 1, and its blur is 0.3 of that
 PAPER_NUMBERS = (1.39, 5.61, 8.79, 12.69, 22.67, 35.61)
@@ -28,7 +26,6 @@ PAPER_DEPTHS_M = np.linspace(0.1, 2.0, 200)
 PAPER_GRID = CircleGrid("asymmetric_circles", 7, 3, 60.0, 40.0)
 
 Array = NDArray[np.float64]
-Photograph = tuple[str, Role, NDArray[np.uint8]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,29 +62,12 @@ class Trial:
         )
 
 
-def _pictures(taken: Sequence[Photograph]) -> list[Picture]:
-    def loader(pixels: NDArray[np.uint8]) -> Callable[[], NDArray[np.uint8]]:
-        return lambda: pixels
-
-    return [Picture(name, role, loader(pixels)) for name, role, pixels in taken]
-
-
 def random_camera(seed: int) -> Trial:
-    """A random camera's photographs from both sides of its focus, calibrated with nothing known.
-
-    As a photographer is told to, the sheet goes no farther from focus than where blur is a third of a radius.
-    """
+    """A random camera's photographs from both sides of its focus, calibrated with nothing known."""
     rng = np.random.default_rng(seed)
     camera = draw_camera(rng)
-    focus_m = camera.focus_distance_m
     count = int(rng.integers(PHOTOGRAPHS[0], PHOTOGRAPHS[1] + 1))
-    taken: list[Photograph] = []
-    reach_m = MOST_BLUR * GRID.diameter_mm / 2e3 * camera.intrinsics.fx_px / camera.k_cam_px
-    nearest_m, farthest_m = max(NEAREST * focus_m, focus_m - reach_m), min(FARTHEST * focus_m, focus_m + reach_m)
-    for depth_m in np.geomspace(nearest_m, farthest_m, count):
-        pose = draw_pose(rng, camera, GRID, float(depth_m))
-        taken.append((f"{depth_m:.2f} m", "defocused", photograph(rng, camera, pose, GRID)))
-    return Trial(camera, calibrate(Task(GRID), _pictures(taken)))
+    return Trial(camera, calibrate(Task(GRID), sweep(rng, camera, GRID, count)))
 
 
 def paper_pairs(number: float, pairs: int, seed: int = 0) -> list[tuple[Method, Trial]]:
@@ -102,16 +82,13 @@ def paper_pairs(number: float, pairs: int, seed: int = 0) -> list[tuple[Method, 
         Intrinsics(1050.0, 1050.0, 639.5, 479.5, (-0.05, 0.02, 0.0, 0.0, 0.0)),
         DISC,
     )
-    taken: list[Photograph] = []
+    taken = []
     for pair in range(pairs):
         pose = draw_pose(rng, camera, PAPER_GRID, PAPER_FOCUS_M / 2 * rng.uniform(0.95, 1.05))
-        taken.append((f"focused {pair}", "focused", photograph(rng, camera, pose, PAPER_GRID, focused=True)))
-        taken.append((f"defocused {pair}", "defocused", photograph(rng, camera, pose, PAPER_GRID)))
+        taken.append(picture(f"focused {pair}", "focused", photograph(rng, camera, pose, PAPER_GRID, focused=True)))
+        taken.append(picture(f"defocused {pair}", "defocused", photograph(rng, camera, pose, PAPER_GRID)))
     methods: tuple[Method, ...] = ("edge", "paper")
-    return [
-        (method, Trial(camera, calibrate(Task(PAPER_GRID, PAPER_FOCUS_M, method), _pictures(taken))))
-        for method in methods
-    ]
+    return [(method, Trial(camera, calibrate(Task(PAPER_GRID, PAPER_FOCUS_M, method), taken))) for method in methods]
 
 
 def error_table(trials: Sequence[Trial]) -> Table:

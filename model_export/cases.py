@@ -112,6 +112,15 @@ def refocused_cases(folder: Path, count: int, camera: Camera = REFERENCE, side: 
         yield Case(photo.name, picture, _to_limit(photo.depth_m), camera, side)
 
 
+def sharp_cases(folder: Path, count: int) -> Iterator[Case]:
+    """A control: frames as they are, said to be by the reference camera, which would have all of them in focus.
+
+    What is answered well all the same was read from what things look like.
+    """
+    for photo in _spread(folder, count):
+        yield Case(photo.name, photo.image, _to_limit(photo.depth_m), REFERENCE, "near")
+
+
 def shuffled_cases(folder: Path, count: int) -> Iterator[Case]:
     """A control: each frame blurred by the depth of one half a set away, scored on its own. Nothing can be right here.
 
@@ -267,9 +276,10 @@ def _indoor_trials(folder: Path, quick: bool) -> list[Trial]:
     found = []
     for k_cam_px in (REFERENCE.k_cam_px,) if quick else UNSEEN_K_CAM_PX:
         camera = replace(REFERENCE, k_cam_px=k_cam_px)
-        further = ("no k_cam", "k_cam -10%", "k_cam +10%") if camera == REFERENCE else ("no k_cam",)
+        further = ("estimated k_cam", "no k_cam", *(("k_cam -10%", "k_cam +10%") if camera == REFERENCE else ()))
         count = many if camera == REFERENCE else several
         found.append(_trial(f"{folder.name} k_cam {k_cam_px:g}", by(camera, count), *further))
+    found.append(_trial(f"{folder.name} in focus", partial(sharp_cases, folder, several)))
     found.append(_trial(f"{folder.name} shuffled", partial(shuffled_cases, folder, several)))
     for view in VIEWS:
         found += [_trial(f"{folder.name} view {view:g}", partial(viewed_cases, folder, several, view))]

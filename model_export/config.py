@@ -59,8 +59,8 @@ class TrainConfig:
 
     The last ``settled_share`` of the steps has the batch norms' statistics fixed, as the exported network has: all of
     them in a run that begins with weights, decoders' too. A ``taught`` run learns teachers' answers too. ``learning``
-    is what moves: all, the depth network alone, or of it only what tells the side by the layout. Of the pictures
-    ``turned_share`` do not stay upright, and for ``hint_share`` a side is asked for.
+    is what moves: all or the depth network alone, either without what tells the side by the layout, or that alone. Of
+    the pictures ``turned_share`` do not stay upright, and for ``hint_share`` a side is asked for.
     """
 
     kind: Kind = "compact"

@@ -40,7 +40,7 @@ def calibrate(model: Path) -> tuple[float, float]:
     seen = [examiner.answer(case)[0].blur for case in cases]
     gain = _told(model, "blur_gain", blur_gain(Pixels.joined([blur for blur in seen if blur is not None])))
     examiner = Examiner(model)
-    found = temperature(Pixels.joined([examiner.told(case, case.camera.k_cam_px)[0].depth for case in cases]))
+    found = temperature(Pixels.joined([examiner.told(case, case.camera)[0].depth for case in cases]))
     return gain, _told(model, "temperature", found)
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from model_export.calibrated import calibrated
 from model_export.cases import UNSEEN_K_CAM_PX, Case, Trial
 from model_export.cores import torch_threads
 from model_export.metrics import Scores, best_constant, completed, mean_scores, pooled_scores, score
@@ -24,14 +25,16 @@ from service.inference.estimator import Estimator
 from service.inference.hypotheses import SIGMA_OF_LAPLACE
 from service.inference.pair import GraphPair, RawMaps
 from service.optics import thin_lens
+from service.optics.camera import Camera
 
 # an unknown camera is taken for the middle one of those that are scored
 UNKNOWN_K_CAM_PX = math.prod(UNSEEN_K_CAM_PX) ** (1 / len(UNSEEN_K_CAM_PX))
-MODES: dict[str, Callable[[float], float]] = {
-    "gt": lambda k_cam_px: k_cam_px,
-    "no k_cam": lambda _: UNKNOWN_K_CAM_PX,
-    "k_cam -10%": lambda k_cam_px: 0.9 * k_cam_px,
-    "k_cam +10%": lambda k_cam_px: 1.1 * k_cam_px,
+MODES: dict[str, Callable[[Camera], Camera]] = {
+    "gt": lambda camera: camera,
+    "estimated k_cam": calibrated,
+    "no k_cam": lambda camera: replace(camera, k_cam_px=UNKNOWN_K_CAM_PX),
+    "k_cam -10%": lambda camera: replace(camera, k_cam_px=0.9 * camera.k_cam_px),
+    "k_cam +10%": lambda camera: replace(camera, k_cam_px=1.1 * camera.k_cam_px),
 }
 # what no user has: they tell how much of an error is the camera's, and how much the side's
 RIGHT_SIDE, ORACLE_K_CAM = "right side", "oracle k_cam"
@@ -298,11 +301,11 @@ class Examiner:
         """Run a case through the estimator, with the camera as the mode tells it, and score the answer."""
         if mode == RIGHT_SIDE:
             return self._scored(case, self._rightly_sided(case))
-        return self.told(case, MODES[mode](case.camera.k_cam_px), blur=mode == "gt")
+        return self.told(case, MODES[mode](case.camera), blur=mode == "gt")
 
-    def told(self, case: Case, k_cam_px: float, *, blur: bool = False) -> tuple[Outcome, Example]:
-        """Score the answer to a case whose camera is said to have that k_cam, and its lambda where asked to."""
-        answered = self._estimator.estimate(case.image, replace(case.camera, k_cam_px=k_cam_px), case.side)
+    def told(self, case: Case, camera: Camera, *, blur: bool = False) -> tuple[Outcome, Example]:
+        """Score the answer to a case that is said to be by some camera, and its lambda where asked to."""
+        answered = self._estimator.estimate(case.image, camera, case.side)
         return self._scored(case, answered, self._blur(case) if blur else None)
 
     def _rightly_sided(self, case: Case) -> DepthMap:
@@ -443,7 +446,8 @@ class _Examined:
             self.outcomes.setdefault(mode, []).append(outcome)
             self.example = self.example or example
         for factor in ORACLE_FACTORS if trial.oracle else ():
-            self.searched.setdefault(factor, []).append(examiner.told(case, factor * case.camera.k_cam_px)[0])
+            scaled = replace(case.camera, k_cam_px=factor * case.camera.k_cam_px)
+            self.searched.setdefault(factor, []).append(examiner.told(case, scaled)[0])
 
     def by_mode(self) -> dict[str, list[Outcome]]:
         """All outcomes, of the factors on k_cam the best one's."""

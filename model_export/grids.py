@@ -10,12 +10,16 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from model_export.render import DISC, GAUSSIAN, PointSpread, blur_varying
+from service.calibration.calibrate import Picture
+from service.calibration.report import Role
 from service.calibration.target import CircleGrid
 from service.optics import thin_lens
 from service.optics.camera import Intrinsics
 from service.optics.light import encode_srgb
 
 GRID = CircleGrid("asymmetric_circles", 11, 4, 20.0, 14.0)
+NEAREST, FARTHEST = 0.6, 1.8  # of the focus distance
+MOST_BLUR = 1 / 3  # of a circle's radius
 INK, PAPER, TABLE = 0.04, 0.75, 0.25
 SHEET_MARGIN_MM = 15.0
 MARGIN_PX = 48
@@ -134,6 +138,26 @@ def photograph(
     pixels = (encode_srgb(noisy.astype(np.float32)) * 255 + 0.5).astype(np.uint8)
     packed = cv2.imencode(".jpg", pixels[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
     return np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)[:, :, ::-1].copy()
+
+
+def picture(name: str, role: Role, rgb: NDArray[np.uint8]) -> Picture:
+    """A photograph as a calibration takes it."""
+    return Picture(name, role, lambda: rgb)
+
+
+def sweep(rng: np.random.Generator, camera: GridCamera, grid: CircleGrid, count: int) -> list[Picture]:
+    """So many photographs from before the plane in focus to behind it, as a photographer is told to take them.
+
+    No farther from focus than where blur is a third of a circle's radius.
+    """
+    focus_m = camera.focus_distance_m
+    reach_m = MOST_BLUR * grid.diameter_mm / 2e3 * camera.intrinsics.fx_px / camera.k_cam_px
+    nearest_m, farthest_m = max(NEAREST * focus_m, focus_m - reach_m), min(FARTHEST * focus_m, focus_m + reach_m)
+    taken = []
+    for depth_m in np.geomspace(nearest_m, farthest_m, count):
+        pose = draw_pose(rng, camera, grid, float(depth_m))
+        taken.append(picture(f"{depth_m:.2f} m", "defocused", photograph(rng, camera, pose, grid)))
+    return taken
 
 
 def _sight(camera: GridCamera, pixels: Array) -> Array:

@@ -399,7 +399,8 @@ class CompactDepth(nn.Module):
     """Ours: starts from the plain inversion and mixes in what the surroundings say, by a learned gate.
 
     Where blur is certain the gate lets eq. 7 through; on flat ground the free estimate fills in. Either way
-    near stays at or before the plane in focus and far behind it. Which it is the finest map tells, and the layout.
+    near stays at or before the plane in focus and far behind it. Which it is the finest map tells, and the layout: but
+    for where ``lays_out`` is off, while all else is learned of scenes too small to show one.
     """
 
     DILATIONS = (2, 4)
@@ -411,7 +412,7 @@ class CompactDepth(nn.Module):
         first = Normed(convolution(features, finest), convolution(self.PLANES, finest))
         self.unet = _compact_unet(first, widths, self.DILATIONS)
         self.coarsest, self.times = widths[-1], 2.0 ** (len(widths) - 1)
-        self.layout = Layout(self.coarsest)
+        self.layout, self.lays_out = Layout(self.coarsest), True
         self.head = nn.Conv2d(finest, 5, 1)
         with torch.no_grad():
             self.head.weight.mul_(0.1)
@@ -427,7 +428,7 @@ class CompactDepth(nn.Module):
             inputs = [near, far, defocus.clamp(max=3.0), torch.log(spread.clamp(1e-3, 10.0)) * 0.3]
             inputs += [_plane(p, defocus) for p in planes]
         *_, coarsest, x = self.unet(*features, torch.cat(inputs, 1))
-        layout_odds = self.layout(coarsest)
+        layout_odds = self.layout(coarsest) if self.lays_out else torch.zeros_like(coarsest[:, :1])
         enlarged = functional.interpolate(layout_odds, scale_factor=self.times, mode="bilinear", align_corners=False)
         with torch.autocast(defocus.device.type, enabled=False):
             out = functional.conv2d(x.float(), self.head.weight, self.head.bias)

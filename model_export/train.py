@@ -28,7 +28,7 @@ from model_export.cores import computes_bfloat16, torch_threads
 from model_export.folded import folded
 from model_export.frames import load_frames
 from model_export.losses import Batch, run_pair, total_loss
-from model_export.networks import SHIPPED_WIDTHS, Pair, Widths, make_pair, with_fresh_decoders
+from model_export.networks import SHIPPED_WIDTHS, CompactDepth, Pair, Widths, make_pair, with_fresh_decoders
 from model_export.optimizers import Optimizers
 from model_export.progress import progress_bar
 from model_export.restored import restored, spread_norms
@@ -210,18 +210,17 @@ def starting_pair(weights: Path, kind: Kind) -> Pair:
     return pair
 
 
-def _learning(pair: Pair, modules: nn.ModuleDict, part: Learning) -> nn.Module:
-    """What of a pair moves in a run; the rest is held as it is.
+def _learning(pair: Pair, part: Learning) -> nn.ModuleList:
+    """What of a pair moves in a run; the rest is held as it is, the layout where it is not what is learned.
 
     Raises ``ValueError`` for a part that the pair does not have.
     """
-    if part == "all":
-        return modules
-    if part == "layout" and pair.kind != "compact":
-        raise ValueError(f"a {pair.kind} pair has no layout to learn")
-    learning = pair.depth if part == "depth" else pair.depth.get_submodule("layout")
-    modules.requires_grad_(requires_grad=False)
-    return learning.requires_grad_()
+    if part == "layout":
+        if pair.kind != "compact":
+            raise ValueError(f"a {pair.kind} pair has no layout to learn")
+        return nn.ModuleList([pair.depth.get_submodule("layout")])
+    depth = [child for name, child in pair.depth.named_children() if name != "layout"]
+    return nn.ModuleList(depth if part == "depth" else [pair.blur, *depth])
 
 
 def learning_rate(config: TrainConfig, step: int) -> float:
@@ -257,7 +256,11 @@ class Trainer:
         self.pair = make_pair(config.kind, widths if resume is None else Widths.of(resume.modules))
         self.modules = self.pair.modules().to(self.device)
         convert_conv2d_weight_memory_format(self.modules, torch.channels_last)
-        self.learning = _learning(self.pair, self.modules, config.learning)
+        self.learning = _learning(self.pair, config.learning)
+        self.modules.requires_grad_(requires_grad=False)
+        self.learning.requires_grad_()
+        if isinstance(self.pair.depth, CompactDepth):
+            self.pair.depth.lays_out = config.learning == "layout"
         self.optimizers = Optimizers(self.modules, config.weight_decay)
         self.teachers: list[Pair] = []
         self.step = 0

@@ -38,7 +38,7 @@ D200 = {
 }
 REFERENCE = Camera(640, 480, 2.0, 3.81, 0.5)
 PLANES_M = (0.7, 1.0, 1.5)
-ABOUT = 1 / 3
+ABOUT = 0.3
 
 
 @pytest.fixture(scope="module")

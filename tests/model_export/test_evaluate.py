@@ -11,7 +11,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from model_export.cases import REFERENCE, Case, Trial, d200_cases, procedural_cases, shuffled_cases, viewed_cases
+from model_export.calibrated import calibrated
+from model_export.cases import (
+    REFERENCE,
+    Case,
+    Trial,
+    d200_cases,
+    procedural_cases,
+    sharp_cases,
+    shuffled_cases,
+    viewed_cases,
+)
 from model_export.cli import commands
 from model_export.corrections import blur_gain, calibrate, temperature
 from model_export.evaluate import (
@@ -86,6 +96,22 @@ def test_a_wrong_k_cam_is_told_to_the_estimator(oracle: Examiner) -> None:
     x = CAMERA.focus_distance_m / right.truth_m[0, -1] - 1
     outcome, _ = oracle.answer(right, "k_cam +10%")
     assert outcome.median_error == pytest.approx((1 + x) / (1 + x / 1.1) - 1, rel=1e-3)
+
+
+def test_a_camera_known_by_its_sheets_alone_is_nearly_the_true_one() -> None:
+    found = calibrated(REFERENCE)
+    assert 0 < abs(found.k_cam_px / REFERENCE.k_cam_px - 1) < 0.03
+    assert found.focus_distance_m == pytest.approx(REFERENCE.focus_distance_m, rel=0.01)
+    assert found.gamma_px == pytest.approx(REFERENCE.gamma_px, abs=0.03)
+    assert found.intrinsics is not None
+    assert REFERENCE.intrinsics is not None
+    assert found.intrinsics.fx_px == pytest.approx(REFERENCE.intrinsics.fx_px, rel=0.01)
+    assert (found.image_width_px, found.image_height_px) == (640, 480)
+
+
+def test_a_camera_that_no_sheet_can_be_photographed_with_is_refused() -> None:
+    with pytest.raises(ValueError, match="intrinsics"):
+        calibrated(replace(REFERENCE, intrinsics=None))
 
 
 def test_the_right_side_is_that_of_each_pixel(oracle: Examiner) -> None:
@@ -263,6 +289,15 @@ def test_a_wider_view_is_made_smaller_and_blurs_alike(tmp_path: Path) -> None:
     assert found.camera.intrinsics.fx_px == 350
 
 
+def test_the_control_in_focus_is_the_frame_as_it_is(tmp_path: Path) -> None:
+    write_photo(tmp_path, "one", 900)
+    (found,) = sharp_cases(tmp_path, 1)
+    photo = cv2.imread(str(tmp_path / "color" / "one.png"))
+    assert photo is not None
+    np.testing.assert_array_equal(found.image, photo[:, :, ::-1])
+    assert np.nanmax(found.truth_m) == pytest.approx(1.8)
+
+
 def test_the_control_blurs_a_frame_by_the_depth_of_another(tmp_path: Path) -> None:
     write_photo(tmp_path, "flat", 1000)
     write_photo(tmp_path, "near", 500)
@@ -304,6 +339,8 @@ def test_the_command_prints_and_writes_what_it_found(data: Path, tiny_model_dir:
     sets = {(s["name"], s["mode"]): s for s in report["sets"]}
     assert sets["indoor k_cam 3.81", "gt"]["pictures"] == 2
     assert sets["rgbd k_cam 3.81", "no k_cam"]["pooled"]["rmse"] > 0
+    assert sets["indoor k_cam 3.81", "estimated k_cam"]["pooled"]["rmse"] > 0
+    assert sets["tabletop in focus", "gt"]["pictures"] == 1
     assert sets["procedural mixed", "gt"]["relief"]["true"] > 0
     assert sets["plane 1 m", "gt"]["relief"] is None
     page = (out / "report.html").read_text()
