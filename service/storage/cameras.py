@@ -13,6 +13,7 @@ from typing import Literal
 from sqlalchemy import Engine
 from sqlalchemy.exc import IntegrityError
 from sqlmodel import Session, col, select
+from sqlmodel.sql.expression import Select
 
 from service.errors import BadRequest, Conflict, NotFound, PreconditionFailed
 from service.optics.camera import Camera, Intrinsics, Lens
@@ -92,17 +93,7 @@ class Cameras:
 
     def page(self, limit: int, after: str | None = None) -> tuple[list[CameraRecord], bool]:
         """Up to ``limit`` cameras by name, from the one behind ``after``; and whether there are more."""
-        query = (
-            select(CameraRow, CameraRevisionRow)
-            .join(CameraRevisionRow, col(CameraRevisionRow.camera_id) == col(CameraRow.id))
-            .where(
-                col(CameraRevisionRow.revision) == col(CameraRow.revision),
-                col(CameraRow.owner) == self._owner,
-                col(CameraRow.deleted_at).is_(None),
-            )
-            .order_by(col(CameraRow.name))
-            .limit(limit + 1)
-        )
+        query = _all_current(self._owner).order_by(col(CameraRow.name)).limit(limit + 1)
         if after is not None:
             query = query.where(col(CameraRow.name) > after)
         with reading(self._engine) as session:
@@ -134,7 +125,7 @@ class Cameras:
 
     def store_calibrated(self, name: str, camera: Camera) -> CameraRecord:
         """Make the camera or give it a new revision, as a calibration found it. Raises ``BadRequest`` for no name."""
-        if not re.fullmatch(NAME_PATTERN, name):
+        if not _is_name(name):
             raise BadRequest(f"'{name[:80]}' is no name for a camera: letters, digits, '.', '_' and '-', 64 at most.")
         with writing(self._engine) as session:
             return store_calibrated(session, self._owner, name, camera)
@@ -183,9 +174,17 @@ def _taken(name: str) -> Conflict:
     return Conflict(f"A camera '{name}' exists already: replace it with PUT /cameras/{name}.")
 
 
+def _unknown(name: str) -> NotFound:
+    return NotFound(f"There is no camera '{name[:64]}': register it with POST /cameras.")
+
+
+def _is_name(name: str) -> bool:
+    """What is no name is in no table, and PostgreSQL refuses some of it (a NUL) outright."""
+    return re.fullmatch(NAME_PATTERN, name) is not None
+
+
 def _find_row(session: Session, owner: str, name: str, *, lock: bool = False) -> CameraRow | None:
-    # what is no name is in no table, and PostgreSQL refuses some of it (a NUL) outright
-    if not re.fullmatch(NAME_PATTERN, name):
+    if not _is_name(name):
         return None
     query = select(CameraRow).where(col(CameraRow.owner) == owner, col(CameraRow.name) == name)
     return session.exec(query.with_for_update() if lock else query).first()
@@ -193,7 +192,7 @@ def _find_row(session: Session, owner: str, name: str, *, lock: bool = False) ->
 
 def _live(row: CameraRow | None, name: str) -> CameraRow:
     if row is None or row.deleted_at is not None:
-        raise NotFound(f"There is no camera '{name[:64]}': register it with POST /cameras.")
+        raise _unknown(name)
     return row
 
 
@@ -205,9 +204,24 @@ def _require_row(session: Session, owner: str, name: str, expected: Sequence[int
     return row
 
 
+def _all_current(owner: str) -> Select[CameraRow, CameraRevisionRow]:
+    """The cameras that an owner has, each with its current revision."""
+    return (
+        select(CameraRow, CameraRevisionRow)
+        .join(CameraRevisionRow, col(CameraRevisionRow.camera_id) == col(CameraRow.id))
+        .where(
+            col(CameraRevisionRow.revision) == col(CameraRow.revision),
+            col(CameraRow.owner) == owner,
+            col(CameraRow.deleted_at).is_(None),
+        )
+    )
+
+
 def _current(session: Session, owner: str, name: str) -> tuple[CameraRow, CameraRevisionRow]:
-    row = _live(_find_row(session, owner, name), name)
-    return row, _revision(session, row, row.revision)
+    found = session.exec(_all_current(owner).where(col(CameraRow.name) == name)).first() if _is_name(name) else None
+    if found is None:
+        raise _unknown(name)
+    return found
 
 
 def _revision(session: Session, row: CameraRow, number: int) -> CameraRevisionRow:
