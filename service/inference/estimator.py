@@ -33,8 +33,9 @@ SMALLER_COPIES = 2
 STRONG_FRACTION = 1e-3  # of the picture: a few cells' noise is not worth the time, and in them alone a part may differ
 COARSER = 0.5
 # how much around a part is read with it: smaller copies see two and four times as far as a tile of the picture.
-# Of parts of 400x300 of refocused frames and table tops of 1920x1440 (k_cam 9 px) one pixel in 9 and one in 4 are off by
-# 1.5 % or more from the whole's answer, the farthest by 6 and 14 %; with 640 px, at 2.7 times the cost, one in 60 and 40
+# Of parts of 400x300 of refocused frames and table tops of 1920x1440 (k_cam 9 px) one pixel in 9 and one in 4 are off
+# by 1.5 % or more from the whole's answer, the farthest by 6 and 14 %; with 640 px, at 2.7 times the cost, one in 60
+# and 40
 SURROUNDINGS_PX = 320
 BLURRED_FRACTION = 0.02
 FEW_ANSWERS = 0.5
