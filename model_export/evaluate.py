@@ -29,12 +29,19 @@ from service.optics.camera import Camera
 
 # an unknown camera is taken for the middle one of those that are scored
 UNKNOWN_K_CAM_PX = math.prod(UNSEEN_K_CAM_PX) ** (1 / len(UNSEEN_K_CAM_PX))
+
+
+def _misled(factor: float, camera: Camera) -> Camera:
+    """The camera with so many times its k_cam."""
+    return replace(camera, k_cam_px=factor * camera.k_cam_px)
+
+
 MODES: dict[str, Callable[[Camera], Camera]] = {
     "gt": lambda camera: camera,
     "estimated k_cam": calibrated,
     "no k_cam": lambda camera: replace(camera, k_cam_px=UNKNOWN_K_CAM_PX),
-    "k_cam -10%": lambda camera: replace(camera, k_cam_px=0.9 * camera.k_cam_px),
-    "k_cam +10%": lambda camera: replace(camera, k_cam_px=1.1 * camera.k_cam_px),
+    "k_cam -10%": partial(_misled, 0.9),
+    "k_cam +10%": partial(_misled, 1.1),
 }
 # what no user has: they tell how much of an error is the camera's, and how much the side's
 RIGHT_SIDE, ORACLE_K_CAM = "right side", "oracle k_cam"
@@ -446,8 +453,7 @@ class _Examined:
             self.outcomes.setdefault(mode, []).append(outcome)
             self.example = self.example or example
         for factor in ORACLE_FACTORS if trial.oracle else ():
-            scaled = replace(case.camera, k_cam_px=factor * case.camera.k_cam_px)
-            self.searched.setdefault(factor, []).append(examiner.told(case, scaled)[0])
+            self.searched.setdefault(factor, []).append(examiner.told(case, _misled(factor, case.camera))[0])
 
     def by_mode(self) -> dict[str, list[Outcome]]:
         """All outcomes, of the factors on k_cam the best one's."""

@@ -1,12 +1,13 @@
 """Whole calibrations, on photographs simulated with the project's renderer; and what goes wrong with photographs."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from model_export.grids import picture
 from service.calibration.calibrate import Picture, Task, calibrate
 from service.calibration.plot import as_svg
 from service.calibration.report import PictureReport, Report
@@ -16,10 +17,7 @@ from tests.simulated_sheets import CAMERA, DEPTHS_M, GRID, Shot, shots
 
 
 def pictures(taken: Sequence[Shot]) -> list[Picture]:
-    def loader(pixels: NDArray[np.uint8]) -> Callable[[], NDArray[np.uint8]]:
-        return lambda: pixels
-
-    return [Picture(name, role, loader(pixels)) for name, role, pixels in taken]
+    return [picture(*shot) for shot in taken]
 
 
 @pytest.fixture(scope="module")

@@ -234,14 +234,14 @@ def test_between_two_copies_no_step_shows(halving: Estimator) -> None:
     rgb = np.repeat(np.repeat(ramp[np.newaxis, :, np.newaxis], 64, axis=0), 3, axis=2)
     answer = halving.estimate(rgb, replace(CAMERA, image_width_px=640), "near")
     assert answer.scales == (1, 0.5, 0.25)
-    steps = np.diff(np.log(answer.blur_px[32, 16:-16]))
+    steps = np.diff(np.log(answer.blur_px[32, 8:-8]))
     assert steps.min() >= 0
-    assert steps.max() < 0.1  # the oracle reads each copy twice as blurred: a step would be ln 2
+    assert steps.max() < 0.05  # the oracle reads each copy twice as blurred: a step would be ln 2
 
 
 @pytest.mark.parametrize(
     ("blur_px", "k_cam_px", "scales"),
-    [(3.4, 6.0, (1,)), (8.0, 0.9, (1,)), (8.0, 1.9, (1, 0.5)), (8.0, 2.1, (1, 0.5, 0.25))],
+    [(3.9, 6.0, (1,)), (8.0, 0.9, (1,)), (8.0, 1.9, (1, 0.5)), (8.0, 2.1, (1, 0.5, 0.25))],
 )
 def test_no_more_copies_are_read_where_no_blur_is_strong_or_the_model_knows_no_such_k_cam(
     halving: Estimator, blur_px: float, k_cam_px: float, scales: tuple[float, ...]
