@@ -32,10 +32,9 @@ STRONG_BLUR = 0.2
 SMALLER_COPIES = 2
 STRONG_FRACTION = 1e-3  # of the picture: a few cells' noise is not worth the time, and in them alone a part may differ
 COARSER = 0.5
-# how much around a part is read with it: smaller copies see two and four times as far as a tile of the picture.
-# Of parts of 400x300 of refocused frames and table tops of 1920x1440 (k_cam 9 px) one pixel in 9 and one in 4 are off
-# by 1.5 % or more from the whole's answer, the farthest by 6 and 14 %; with 640 px, at 2.7 times the cost, one in 60
-# and 40
+# how much around a part is read with it, in pixels of each copy: smaller ones see two and four times as far. Of parts of
+# 400x300 of refocused frames and table tops of 1920x1440 (k_cam 9 px) one pixel in 12 and one in 43 are off by 1.5 % or
+# more from the whole's answer, the farthest by 5 and 6 %; with the same 320 px for all, one in 9 and 4, 6 and 14 %
 SURROUNDINGS_PX = 320
 BLURRED_FRACTION = 0.02
 FEW_ANSWERS = 0.5
@@ -46,24 +45,50 @@ WARM_UP_PX = 64
 
 @dataclass(frozen=True, slots=True)
 class _Request:
-    """What all copies and tiles of one photograph are read with."""
+    """What all copies and tiles are read of: an upright photograph, or a part of it, by the camera behind the whole."""
 
+    rgb: NDArray[np.uint8]
+    camera: Camera
     side: Side = "auto"
     cancellation: Cancellation = field(default_factory=Cancellation)
+    part: Part | None = None
     stopwatch: Stopwatch = field(default_factory=Stopwatch)
+
+    def area(self, scale: float, multiple: int) -> Part:
+        """What a copy of this scale shows: the photograph, or the part and what the copy needs around it.
+
+        It starts where a copy of the whole has the first pixel of so many, so that both have the same cells.
+        """
+        height, width = self.rgb.shape[:2]
+        part = self.part or Part(0, 0, width, height)
+        return part.widened(round(SURROUNDINGS_PX / scale), round(multiple / scale), width, height)
 
 
 @dataclass(frozen=True, slots=True)
 class Read:
-    """The networks' maps, of the copy that this camera's pictures are as large as.
+    """The networks' maps of an area of the photograph, and the camera behind the copy of it that was read.
 
-    Copies of ``widths_px`` were read; blur above ``most_blur_px``, in pixels of the first, is beyond the model.
+    Copies of ``scales`` were read, each of an area of its own; blur above ``most_blur_px``, in pixels of the first, is
+    beyond the model.
     """
 
     maps: RawMaps
     camera: Camera
-    widths_px: tuple[int, ...]
+    area: Part
+    scales: tuple[float, ...]
     most_blur_px: float
+
+    @property
+    def ratio(self) -> Ratio:
+        """Pixels of the copy per pixel of the photograph."""
+        camera, area = self.camera, self.area
+        return Ratio.between((area.height_px, area.width_px), (camera.image_height_px, camera.image_width_px), 1)
+
+    def maps_from(self, inner: Part, stride: int) -> RawMaps:
+        """The maps, as views, from where an area within this one begins."""
+        begins = inner.within(self.area)
+        down, across = round(begins.top * self.ratio.rows / stride), round(begins.left * self.ratio.columns / stride)
+        return {name: values[down:, across:] for name, values in self.maps.items()}
 
 
 class Estimator:
@@ -110,54 +135,36 @@ class Estimator:
         height, width = rgb.shape[:2]
         if (width, height) != (camera.image_width_px, camera.image_height_px):
             raise ValueError(f"the camera must be that of a {width}x{height} image: resize it first")
-        request = _Request(side, cancellation or Cancellation())
-        scale = self._base_scale(camera)
-        whole_px = max(width, height) * scale
-        if part is None:
-            return self._estimate(rgb, camera, scale, whole_px, request)
-        around = part.widened(round(SURROUNDINGS_PX / scale), self.manifest.multiple, width, height)
-        within = part.within(around)
-        return self._estimate(around.of(rgb), around.behind(camera), scale, whole_px, request, within)
-
-    def read(self, rgb: NDArray[np.uint8], camera: Camera, side: Side = "auto") -> Read:
-        """What the networks answer, before it is decided what that means: for measuring them."""
-        scale = self._base_scale(camera)
-        whole_px = max(camera.image_width_px, camera.image_height_px) * scale
-        return self._read_copies(rgb, _copied(camera, scale), whole_px, _Request(side))
-
-    def _estimate(
-        self,
-        rgb: NDArray[np.uint8],
-        camera: Camera,
-        scale: float,
-        whole_px: float,
-        request: _Request,
-        part: Part | None = None,
-    ) -> DepthMap:
-        height, width = rgb.shape[:2]
-        stopwatch = request.stopwatch
-        read = self._read_copies(rgb, _copied(camera, scale), whole_px, request)
-        reading = Reading.of(read.maps, read.camera, (height, width), self.manifest, request.side, read.most_blur_px)
-        if height * width > SMALL_PX:
+        request = _Request(rgb, camera, side, cancellation or Cancellation(), part)
+        read = self._read_copies(request, self._base_scale(camera))
+        area, stopwatch = read.area, request.stopwatch
+        size = (area.height_px, area.width_px)
+        reading = Reading.of(read.maps, read.camera, size, self.manifest, side, read.most_blur_px)
+        if area.height_px * area.width_px > SMALL_PX:
             self._freeing.ask()  # what a large picture has taken is kept for the next one, but for a while only
         request.cancellation.check()
         with stopwatch.stage("encode"):
-            depth_m, valid = decide(reading, (height, width))
+            depth_m, valid = decide(reading, size)
         answer = DepthMap(
             depth_m=depth_m,
             valid=valid,
-            layers=all_layers(reading, (height, width)),
-            camera=camera,
-            scales=tuple(size / width for size in read.widths_px),
+            layers=all_layers(reading, size),
+            camera=area.behind(camera),
+            scales=read.scales,
             warnings=(),
             timings_ms=stopwatch.elapsed_ms,
         )
         blur_px = reading.blur_px
         if part is not None:
-            answer, blur_px = answer.cut(part), part.cells_of(blur_px, (height, width))
+            within = part.within(area)
+            answer, blur_px = answer.cut(within), within.cells_of(blur_px, size)
         blurrier = float((blur_px > read.most_blur_px / reading.scale).mean())
         warnings = (*self._warnings(reading, whole=part is None), *_hardness(blurrier, answer.valid_fraction))
         return replace(answer, warnings=warnings)
+
+    def read(self, rgb: NDArray[np.uint8], camera: Camera, side: Side = "auto") -> Read:
+        """What the networks answer, before it is decided what that means: for measuring them."""
+        return self._read_copies(_Request(rgb, camera, side), self._base_scale(camera))
 
     def _base_scale(self, camera: Camera) -> float:
         """The largest copy whose k_cam the model reads well, or a smaller one of a large picture; never enlarged."""
@@ -165,36 +172,28 @@ class Estimator:
         longer_px = max(camera.image_width_px, camera.image_height_px)
         return min(1.0, at_most, max(WIDE_PX / longer_px, FINE_K_CAM_PX / camera.k_cam_px))
 
-    def _read_copies(
-        self,
-        rgb: NDArray[np.uint8],
-        working: Camera,
-        whole_px: float,
-        request: _Request,
-        smaller: int = SMALLER_COPIES,
-    ) -> Read:
-        """What a copy shows that is as large as that camera's pictures, and for strong blur up to so many smaller ones.
-
-        ``whole_px`` is the longer side of such a copy of all of the photograph, of which this may be a part.
-        """
-        maps = self._read_copy(rgb, working, whole_px, request)
-        most_blur_px, coarser = self.manifest.ranges.blur_px.high, _copied(working, COARSER)
+    def _read_copies(self, request: _Request, scale: float, smaller: int = SMALLER_COPIES) -> Read:
+        """What a copy of that scale shows, and for strong blur up to so many smaller ones."""
+        area = request.area(scale, self.manifest.multiple)
+        working = _copied(area.behind(request.camera), scale)
+        maps = self._read_copy(request, area, working, scale)
+        most_blur_px = self.manifest.ranges.blur_px.high
         strong_px = STRONG_BLUR * most_blur_px
-        is_read_better = smaller > 0 and coarser.k_cam_px >= self.manifest.ranges.k_cam_px.low
+        read = Read(maps, working, area, (working.image_width_px / area.width_px,), most_blur_px)
+        is_read_better = smaller > 0 and working.k_cam_px * COARSER >= self.manifest.ranges.k_cam_px.low
         if not is_read_better or float((maps["blur_px"] > strong_px).mean()) <= STRONG_FRACTION:
-            return Read(maps, working, (working.image_width_px,), most_blur_px)
-        ratio = Ratio.between(
-            (working.image_height_px, working.image_width_px), (coarser.image_height_px, coarser.image_width_px), 1
-        )
-        told = self._read_copies(rgb, coarser, whole_px * COARSER, request, smaller - 1)
+            return read
+        told = self._read_copies(request, scale * COARSER, smaller - 1)
         with request.stopwatch.stage("correct"):
-            blend(maps, told.maps, ratio, strong_px)
-        return Read(maps, working, (working.image_width_px, *told.widths_px), told.most_blur_px / COARSER)
+            ratio = Ratio(*(small / large for small, large in zip(told.ratio, read.ratio, strict=True)))
+            blend(maps, told.maps_from(area, self.manifest.stride), ratio, strong_px)
+        return replace(read, scales=read.scales + told.scales, most_blur_px=told.most_blur_px / COARSER)
 
-    def _read_copy(self, rgb: NDArray[np.uint8], working: Camera, whole_px: float, request: _Request) -> RawMaps:
+    def _read_copy(self, request: _Request, area: Part, working: Camera, scale: float) -> RawMaps:
         """The maps of a copy as large as that camera's pictures; the layout is seen where all of it is not too wide."""
-        size = (working.image_width_px, working.image_height_px)
+        rgb, size = area.of(request.rgb), (working.image_width_px, working.image_height_px)
         copy = rgb if size == rgb.shape[1::-1] else cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+        whole_px = max(request.rgb.shape[:2]) * scale
         is_wide = whole_px > WIDE_PX
         side, cancellation, stopwatch = request.side, request.cancellation, request.stopwatch
         maps = read_in_tiles(

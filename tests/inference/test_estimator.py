@@ -176,7 +176,7 @@ def test_a_large_k_cam_is_read_on_a_smaller_copy_and_reported(estimator: Estimat
     np.testing.assert_allclose(answer.depth_m, thin_lens.depth_near(x, 2.0), rtol=1e-4)
     np.testing.assert_allclose(answer.blur_px, working_blur * 4, rtol=1e-4)
     assert "read at 0.25 of full size (150x100)" in answer.warnings
-    assert answer.camera is camera
+    assert answer.camera == camera
 
 
 @pytest.mark.parametrize(
@@ -328,6 +328,40 @@ def test_a_part_is_read_with_its_surroundings_and_no_more(folder: Path, monkeypa
     ((height, width, _),) = seen
     assert 60 + 2 * SURROUNDINGS_PX <= width < 60 + 2 * SURROUNDINGS_PX + 16
     assert 30 + 2 * SURROUNDINGS_PX <= height < 30 + 2 * SURROUNDINGS_PX + 16
+
+
+@pytest.mark.parametrize(
+    ("size", "k_cam_px", "part"),
+    [
+        ((1440, 1920), 6.0, Part(700, 501, 900, 640)),
+        ((1441, 1923), 6.0, Part(1801, 1300, 1923, 1441)),
+        ((2304, 3072), 12.0, Part(2000, 1100, 2200, 1300)),  # read at 0.42 of full size
+    ],
+)
+def test_a_part_of_strong_blur_is_read_on_smaller_copies_of_more_that_surrounds_it(
+    halving: Estimator, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int], k_cam_px: float, part: Part
+) -> None:
+    down, across = (np.linspace(brightness_for(1.5), brightness_for(4.5), pixels) for pixels in size)
+    rgb = np.repeat((down[:, np.newaxis] + across).round().astype(np.uint8)[..., np.newaxis], 3, axis=2)
+    camera = Camera(size[1], size[0], 2.0, k_cam_px)
+    whole = halving.estimate(rgb, camera, "near")
+    seen: list[tuple[int, ...]] = []
+    see = GraphPair.see
+
+    def noting(pair: GraphPair, tile: NDArray[np.uint8], cancellation: Cancellation) -> RawMaps:
+        seen.append(tile.shape)
+        return see(pair, tile, cancellation)
+
+    monkeypatch.setattr(GraphPair, "see", noting)
+    answer = halving.estimate(rgb, camera, "near", part=part)
+    assert answer.scales == pytest.approx(whole.scales, rel=0.01)
+    assert len(seen) == 3
+    for tile, scale in zip(seen, answer.scales, strict=True):
+        area = part.widened(round(SURROUNDINGS_PX / scale), 1, size[1], size[0])
+        assert -1 / scale <= tile[0] / scale - area.height_px < 18 / scale
+        assert -1 / scale <= tile[1] / scale - area.width_px < 18 / scale
+    # a step of brightness is 2 % of this blur
+    np.testing.assert_allclose(answer.blur_px, part.of(whole.blur_px), rtol=0.02 if answer.scales[0] < 1 else 1e-3)
 
 
 def test_a_part_is_warned_of_for_itself(tmp_path: Path) -> None:
