@@ -1,7 +1,7 @@
 """What training minimises: L_depth + b_weight * L_blur (eq. 8), each a likelihood, so that errors are stated."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -24,6 +24,8 @@ STANDING_OUT = 3.0
 AROUND = 33  # cells of the networks' resolution, across
 FULLY_OUT = 0.5
 
+Mirror = tuple[int, ...]  # axes of [n,c,h,w]; none: as it is
+
 
 @dataclass(frozen=True, slots=True)
 class Batch:
@@ -32,6 +34,7 @@ class Batch:
     ``told_gamma_px`` is what the correction is given: a guess where gamma is not known. ``side`` is the one
     asked for, 0 for both: the other may be in the picture. ``place`` in 0..1 is which pixel of a network's cell its
     truth is, down and across: any at times, for always the first would move all answers by half a pixel.
+    ``mirrors`` are the axes along which teachers see it mirrored: what they answer on average errs less.
     """
 
     image: Tensor
@@ -43,6 +46,7 @@ class Batch:
     focal_length_px: Tensor
     side: Tensor
     place: tuple[float, float] = field(default=(0.0, 0.0), kw_only=True)
+    mirrors: tuple[Mirror, ...] = field(default=((),), kw_only=True)
 
     def scene(self) -> Scene:
         return Scene(self.focus_distance_m, self.focal_length_px, self.side)
@@ -97,13 +101,18 @@ def standing_out(log_truth: Tensor, emphasis: float = 1.0) -> Tensor:
 
 
 def told_by(teachers: Sequence[Pair], batch: Batch) -> tuple[BlurEstimate, DepthEstimate]:
-    """What pairs answer on average, in logarithms and logits: of different descent, they err differently."""
+    """What pairs answer on average, in logarithms and logits: of different descent, they err differently.
+
+    So does one pair of a picture and of its mirror images: the mean over the batch's ``mirrors`` is taken too.
+    """
 
     def mean(maps: Iterable[Tensor]) -> Tensor:
-        return torch.stack(list(maps)).mean(0)
+        return torch.stack([back.flip(mirror) for back, mirror in zip(maps, mirrors, strict=True)]).mean(0)
 
+    mirrors = batch.mirrors * len(teachers)
+    seen = [replace(batch, image=batch.image.flip(mirror)) for mirror in batch.mirrors]
     with torch.no_grad():
-        blurs, depths = zip(*(run_pair(teacher, batch) for teacher in teachers), strict=True)
+        blurs, depths = zip(*(run_pair(teacher, view) for teacher in teachers for view in seen), strict=True)
         blur_px = torch.exp(mean(torch.log(blur.blur_px) for blur in blurs))
         depth = DepthEstimate(*(mean(getattr(depth, name) for depth in depths) for name in DepthEstimate.__slots__))
         return BlurEstimate(blur_px, mean(blur.log_error for blur in blurs), ()), depth

@@ -32,9 +32,10 @@ STRONG_BLUR = 0.2
 SMALLER_COPIES = 2
 STRONG_FRACTION = 1e-3  # of the picture: a few cells' noise is not worth the time, and in them alone a part may differ
 COARSER = 0.5
-# how much around a part is read with it, in pixels of each copy: smaller ones see two and four times as far. Of parts of
-# 400x300 of refocused frames and table tops of 1920x1440 (k_cam 9 px) one pixel in 12 and one in 43 are off by 1.5 % or
-# more from the whole's answer, the farthest by 5 and 6 %; with the same 320 px for all, one in 9 and 4, 6 and 14 %
+# how much around a part is read with it, in pixels of each copy: smaller ones see two and four times as far. Of
+# parts of 400x300 of refocused frames and table tops of 1920x1440 (k_cam 9 px) one pixel in 12 and one in 43 are off
+# by 1.5 % or more from the whole's answer, the farthest by 5 and 6 %; with 320 px of the first for all copies, one in
+# 9 and 4, 6 and 14 %
 SURROUNDINGS_PX = 320
 BLURRED_FRACTION = 0.02
 FEW_ANSWERS = 0.5

@@ -303,6 +303,29 @@ def test_several_teachers_answer_as_their_mean() -> None:
     assert not torch.equal(one.near_logit, other.near_logit)
 
 
+def test_a_teacher_answers_a_mirror_image_as_the_picture_where_it_sees_both() -> None:
+    batch = collate([draw_sample(i, SCENES) for i in range(2)], np.random.default_rng(0))
+    pair = make_pair("compact")
+    pair.modules().eval()
+    for mirrors, alike in ((((), (3,)), True), (((),), False)):
+        seen = replace(batch, mirrors=mirrors)
+        (blur, depth), (mirrored_blur, mirrored) = (
+            told_by([pair], one) for one in (seen, replace(seen, image=seen.image.flip(3)))
+        )
+        for own, other in (
+            (blur.blur_px, mirrored_blur.blur_px),
+            (depth.log_ratio_near, mirrored.log_ratio_near),
+            (depth.log_scale, mirrored.log_scale),
+        ):
+            assert torch.allclose(own, other.flip(3), atol=1e-5) is alike
+
+
+def test_every_batch_is_shown_to_teachers_upright_and_upside_down() -> None:
+    sample = draw_sample(0, SCENES)
+    drawn = {collate([sample], np.random.default_rng(seed)).mirrors for seed in range(40)}
+    assert drawn == {(one, other) for one in ((), (3,)) for other in ((2,), (2, 3))}
+
+
 def test_the_side_is_learned_from_the_truth_alone() -> None:
     """How often it is near is that of a teacher's own scenes."""
     batch = collate([draw_sample(seed, SCENES) for seed in range(2)], np.random.default_rng(0))
