@@ -258,7 +258,7 @@ def trials(data: Path, quick: bool) -> list[Trial]:
         found += _indoor_trials(folder, quick)
     if (data / "d200").is_dir():
         source = partial(d200_cases, data / "d200", 2 * many)
-        found.append(replace(_trial("d200", source, "right side"), oracle=True))
+        found.append(replace(_trial("d200", source, "right side", "ring from the sensor"), oracle=True))
     return found
 
 

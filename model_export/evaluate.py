@@ -36,12 +36,18 @@ def _misled(factor: float, camera: Camera) -> Camera:
     return replace(camera, k_cam_px=factor * camera.k_cam_px)
 
 
+def _counted_from_lens(camera: Camera) -> Camera:
+    """The camera whose focus distance is a ring's, which counts it from the sensor."""
+    return camera.focused_at(thin_lens.focus_from_lens(camera.focus_distance_m, camera.focal_length_m or 0.0))
+
+
 MODES: dict[str, Callable[[Camera], Camera]] = {
     "gt": lambda camera: camera,
     "estimated k_cam": calibrated,
     "no k_cam": lambda camera: replace(camera, k_cam_px=UNKNOWN_K_CAM_PX),
     "k_cam -10%": partial(_misled, 0.9),
     "k_cam +10%": partial(_misled, 1.1),
+    "ring from the sensor": _counted_from_lens,
 }
 # what no user has: they tell how much of an error is the camera's, and how much the side's
 RIGHT_SIDE, ORACLE_K_CAM = "right side", "oracle k_cam"

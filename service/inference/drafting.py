@@ -12,6 +12,7 @@ from functools import lru_cache
 import lensfunpy
 
 from service.inference.exif import Exif
+from service.optics import thin_lens
 
 FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
 SENSOR_WIDTHS_MM = (1.0, 70.0)
@@ -85,9 +86,13 @@ def _focus_m(exif: Exif, warnings: list[str]) -> float | None:
     if distance_m is None or not FOCUS_DISTANCES_M[0] <= distance_m <= FOCUS_DISTANCES_M[1]:
         warnings.append("its EXIF does not say where the lens was focused: focus_distance_m is needed")
         return None
+    focal_length_m, from_lens = (exif.focal_length_mm or math.inf) / 1e3, ""
+    if 4 * focal_length_m <= distance_m:
+        focus_m = thin_lens.focus_from_lens(distance_m, focal_length_m)
+        from_lens = f" and counted from the sensor, {focus_m:.4g} m from the lens"
     warnings.append(
-        f"focused at {distance_m:g} m as the camera reports it, which is often coarse: better measure from the lens to "
-        "what is sharpest"
+        f"focused at {distance_m:g} m as the camera reports it, which is often coarse{from_lens}: better measure from "
+        "the lens to what is sharpest"
     )
     return distance_m
 

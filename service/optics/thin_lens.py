@@ -177,3 +177,14 @@ def k_cam_at_focus(k_cam_px: float, focal_length_m: float, old_focus_m: float, n
     if focal_length_m >= min(old_focus_m, new_focus_m):
         raise ValueError("the focal length must be shorter than the focus distance")
     return k_cam_px * (old_focus_m - focal_length_m) / (new_focus_m - focal_length_m)
+
+
+def focus_from_lens(focus_from_sensor_m: float, focal_length_m: float) -> float:
+    """s1 in metres from the lens, where a ring or EXIF counts it from the sensor: s1 + s2 = D with 1/s1 + 1/s2 = 1/f.
+
+    Of the two such lenses the one nearer to the sensor. Raises ``ValueError`` below D = 4 f, nearer than which a thin
+    lens forms no image.
+    """
+    if focus_from_sensor_m < 4 * focal_length_m:
+        raise ValueError("a lens forms no image of what is nearer to the sensor than four focal lengths")
+    return focus_from_sensor_m / 2 * (1 + math.sqrt(1 - 4 * focal_length_m / focus_from_sensor_m))

@@ -80,6 +80,18 @@ def test_a_lens_cannot_focus_within_its_focal_length(call: Callable[[], float]) 
         call()
 
 
+@given(st.floats(0.004, 0.2), st.floats(2.01, 500))
+def test_what_a_ring_counts_from_the_sensor_is_object_and_image_distance_together(focal: float, times: float) -> None:
+    from_lens = times * focal
+    behind = 1 / (1 / focal - 1 / from_lens)
+    assert thin_lens.focus_from_lens(from_lens + behind, focal) == pytest.approx(from_lens, rel=1e-6)
+
+
+def test_nothing_is_sharp_that_is_nearer_to_the_sensor_than_four_focal_lengths() -> None:
+    with pytest.raises(ValueError, match="four focal lengths"):
+        thin_lens.focus_from_lens(0.39, 0.1)
+
+
 def test_depth_error_is_the_derivative_of_depth() -> None:
     s1, k, depth, step = 2.0, 3.81, 1.2, 1e-6
     x = thin_lens.relative_defocus(depth, s1)
