@@ -55,7 +55,7 @@ class Reading:
     ) -> Self:
         """``photograph_size`` is (height, width). The maps are taken over and written over: they may be large.
 
-        Where the side is given its hypothesis is the answer, but near where no far one can exist. No error is stated
+        Where the side is given its hypothesis is the answer, or nothing where no far one can exist. No error is stated
         below the floor of optics, and nothing answered of more blur than ``most_blur_px``, in pixels of the copy.
         """
         blur_px, p_near = maps["blur_px"], maps["p_near"]
@@ -72,12 +72,15 @@ class Reading:
             has_far = least_x < 1
             near_m = np.exp(depth_m[rows]) * focus_m
             far_m = np.where(has_far, np.exp(other_m[rows]) * focus_m, near_m)
-            np.copyto(p_near[rows], 1, where=~has_far)
+            if side != "far":
+                np.copyto(p_near[rows], 1, where=~has_far)
             own = np.exp(error[rows]) * (SIGMA_OF_LAPLACE * temperature)
             answer_m, deviation, is_far = merged(near_m, far_m, p_near[rows], own)
             least = np.float32(floor) * answer_m
             is_known = (np.fmax(own, least) <= MAX_RELATIVE_ERROR) & (blur_px[rows] <= most_blur_px)
             is_known &= (nearest * focus_m <= answer_m) & (answer_m <= farthest * focus_m)
+            if side == "far":
+                is_known &= has_far
             depth_m[rows] = answer_m
             other_m[rows] = np.where(is_far, near_m, np.where(has_far, far_m, np.float32(np.nan)))
             error[rows] = np.where(is_known, np.clip(deviation, least, MOST_STATED), NO_ANSWER)

@@ -81,15 +81,26 @@ def test_sigma_is_never_below_what_a_twentieth_of_a_pixel_does_to_depth(estimato
     np.testing.assert_allclose(answer.sigma_m, floor, rtol=1e-4)
 
 
-def test_relative_defocus_of_one_and_more_is_near_whatever_is_asked(estimator: Estimator) -> None:
+@pytest.mark.parametrize("side", ["auto", "near"])
+def test_relative_defocus_of_one_and_more_is_near(estimator: Estimator, side: Side) -> None:
     level = 200
     x = expected_x(level)
     assert x > 1
-    for side in ("auto", "near", "far"):
-        answer = estimator.estimate(grey(level), CAMERA, side)
-        np.testing.assert_allclose(answer.depth_m, thin_lens.depth_near(x, 2.0), rtol=1e-4)
-        assert np.isnan(answer.depth_alt_m).all()
-        assert (answer.p_near == 1).all()
+    answer = estimator.estimate(grey(level), CAMERA, side)
+    np.testing.assert_allclose(answer.depth_m, thin_lens.depth_near(x, 2.0), rtol=1e-4)
+    assert np.isnan(answer.depth_alt_m).all()
+    assert (answer.p_near == 1).all()
+
+
+def test_of_what_is_far_blur_that_only_near_things_have_has_no_answer(estimator: Estimator) -> None:
+    halves = grey(100)
+    halves[:, 48:] = 200
+    answer = estimator.estimate(halves, CAMERA, "far")
+    assert (answer.depth_m[:, :46] > CAMERA.focus_distance_m).all()
+    assert answer.valid[:, :46].all()
+    assert not answer.valid[:, 50:].any()
+    assert np.isnan(answer.depth_m[:, 50:]).all()
+    assert (answer.p_near == 0).all()
 
 
 @pytest.mark.parametrize(
