@@ -58,9 +58,10 @@ class TrainConfig:
     """A training run: ``steps`` batches, drawn from a pool that ``fresh_per_step`` new scenes flow through.
 
     The last ``settled_share`` of the steps has the batch norms' statistics fixed, as the exported network has: all of
-    them in a run that begins with weights, decoders' too. A ``taught`` run learns teachers' answers too. ``learning``
-    is what moves: all or the depth network alone, either without what tells the side by the layout, or that alone. Of
-    the pictures ``turned_share`` do not stay upright, and for ``hint_share`` a side is asked for.
+    them in a run that begins with weights, decoders' too. A ``taught`` run learns teachers' answers too, the side of
+    focus among them where ``side_weight`` is 0. ``learning`` is what moves: all or the depth network alone, either
+    without what tells the side by the layout, or that alone. Of the pictures ``turned_share`` do not stay upright, and
+    for ``hint_share`` a side is asked for.
     """
 
     kind: Kind = "compact"

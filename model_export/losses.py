@@ -103,7 +103,8 @@ def standing_out(log_truth: Tensor, emphasis: float = 1.0) -> Tensor:
 def told_by(teachers: Sequence[Pair], batch: Batch) -> tuple[BlurEstimate, DepthEstimate]:
     """What pairs answer on average, in logarithms and logits: of different descent, they err differently.
 
-    So does one pair of a picture and of its mirror images: the mean over the batch's ``mirrors`` is taken too.
+    So does one pair of a picture and of its mirror images: the mean over the batch's ``mirrors`` is taken too. The side
+    is asked of upright ones alone: what is lower is nearer.
     """
 
     def mean(maps: Iterable[Tensor]) -> Tensor:
@@ -114,14 +115,24 @@ def told_by(teachers: Sequence[Pair], batch: Batch) -> tuple[BlurEstimate, Depth
     with torch.no_grad():
         blurs, depths = zip(*(run_pair(teacher, view) for teacher in teachers for view in seen), strict=True)
         blur_px = torch.exp(mean(torch.log(blur.blur_px) for blur in blurs))
-        depth = DepthEstimate(*(mean(getattr(depth, name) for depth in depths) for name in DepthEstimate.__slots__))
+        upright = (
+            depth.near_logit.flip(mirror) for depth, mirror in zip(depths, mirrors, strict=True) if 2 not in mirror
+        )
+        depth = DepthEstimate(
+            mean(depth.log_ratio_near for depth in depths),
+            mean(depth.log_ratio_far for depth in depths),
+            torch.stack(list(upright)).mean(0),
+            mean(depth.log_scale for depth in depths),
+        )
         return BlurEstimate(blur_px, mean(blur.log_error for blur in blurs), ()), depth
 
 
-def likeness_loss(blur: BlurEstimate, depth: DepthEstimate, teachers: Sequence[Pair], batch: Batch) -> Tensor:
+def likeness_loss(
+    blur: BlurEstimate, depth: DepthEstimate, teachers: Sequence[Pair], batch: Batch, *, of_side: bool = False
+) -> Tensor:
     """How far the answers are from the teachers', most where these are sure: float32 scalar.
 
-    But for the side: how often it is near is that of the scenes a teacher saw.
+    But for the side, if not asked for: how often it is near is that of the scenes a teacher saw.
     """
     wise_blur, wise_depth = told_by(teachers, batch)
     sure_blur = torch.exp(-BETA * wise_blur.log_error)
@@ -130,7 +141,8 @@ def likeness_loss(blur: BlurEstimate, depth: DepthEstimate, teachers: Sequence[P
     of_near = sure_depth * (depth.log_ratio_near - wise_depth.log_ratio_near).abs()
     of_far = sure_depth * (depth.log_ratio_far - wise_depth.log_ratio_far).abs()
     of_errors = (blur.log_error - wise_blur.log_error).abs() + (depth.log_scale - wise_depth.log_scale).abs()
-    return (of_blur + of_near + of_far + of_errors / 2).mean()
+    side = (torch.sigmoid(depth.near_logit) - torch.sigmoid(wise_depth.near_logit)).abs() if of_side else 0.0
+    return (of_blur + of_near + of_far + of_errors / 2 + side).mean()
 
 
 def total_loss(
@@ -157,6 +169,6 @@ def total_loss(
     loss = depth_loss + config.b_weight * blur_loss + config.side_weight * side
     parts = {"loss": loss, "blur": blur_error.mean(), "depth": (asked * depth_error).sum() / asked.sum(), "side": side}
     if teachers:
-        parts["likeness"] = likeness_loss(blur, depth, teachers, batch)
+        parts["likeness"] = likeness_loss(blur, depth, teachers, batch, of_side=not config.side_weight)
         parts["loss"] = loss + config.likeness_weight * parts["likeness"]
     return parts["loss"], {name: part.detach() for name, part in parts.items()}

@@ -283,6 +283,8 @@ class Trainer:
         self.teachers = [folded(teacher) for teacher in teachers]
         for teacher in self.teachers:
             convert_conv2d_weight_memory_format(teacher.modules().to(self.device), torch.channels_last)
+            if isinstance(teacher.depth, CompactDepth):
+                teacher.depth.lays_out = False  # nor is the layout seen in what learns
 
     def autocast(self) -> torch.autocast:
         """bfloat16 where the hardware computes it; emulated on an older processor it is ten times slower."""

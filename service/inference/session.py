@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from service.inference.artifact import GraphFile, ModelFolderError
 from service.inference.cancellation import Cancellation, Cancelled
 
+# how long a thread waits awake for the next operator: from one to the next, not to the next picture
+AWAKE_US = "100"
 LOG_FATAL_ONLY = 4
 GROW_AS_ASKED = 1
 
@@ -44,7 +46,7 @@ class Graph:
         options.intra_op_num_threads = intra_op_threads
         options.inter_op_num_threads = 1
         options.enable_mem_pattern = False
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        options.add_session_config_entry("session.intra_op.spin_duration_us", AWAKE_US)
         options.add_session_config_entry("session.use_env_allocators", "1")
         try:
             self._session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])

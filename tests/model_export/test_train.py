@@ -326,7 +326,7 @@ def test_every_batch_is_shown_to_teachers_upright_and_upside_down() -> None:
     assert drawn == {(one, other) for one in ((), (3,)) for other in ((2,), (2, 3))}
 
 
-def test_the_side_is_learned_from_the_truth_alone() -> None:
+def test_the_side_is_learned_from_the_truth_alone_where_it_is_learned_from_that() -> None:
     """How often it is near is that of a teacher's own scenes."""
     batch = collate([draw_sample(seed, SCENES) for seed in range(2)], np.random.default_rng(0))
     wise, pair = make_pair("compact"), make_pair("compact")
@@ -335,8 +335,11 @@ def test_the_side_is_learned_from_the_truth_alone() -> None:
     with torch.no_grad():
         before = likeness_loss(*run_pair(pair, batch), [wise], batch)
         bias = wise.modules().get_parameter("depth.head.bias")
+        own = run_pair(pair, batch)
+        sided = likeness_loss(*own, [wise], batch, of_side=True)
         bias[3] += 4
-        assert torch.equal(likeness_loss(*run_pair(pair, batch), [wise], batch), before)
+        assert torch.equal(likeness_loss(*own, [wise], batch), before)
+        assert not torch.equal(likeness_loss(*own, [wise], batch, of_side=True), sided)
         bias[0] += 4
         assert not torch.equal(likeness_loss(*run_pair(pair, batch), [wise], batch), before)
 
