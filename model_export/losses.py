@@ -25,6 +25,8 @@ AROUND = 33  # cells of the networks' resolution, across
 FULLY_OUT = 0.5
 
 Mirror = tuple[int, ...]  # axes of [n,c,h,w]; none: as it is
+UPRIGHT: tuple[Mirror, Mirror] = ((), (3,))
+UPSIDE_DOWN: tuple[Mirror, Mirror] = ((2,), (2, 3))
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +36,8 @@ class Batch:
     ``told_gamma_px`` is what the correction is given: a guess where gamma is not known. ``side`` is the one
     asked for, 0 for both: the other may be in the picture. ``place`` in 0..1 is which pixel of a network's cell its
     truth is, down and across: any at times, for always the first would move all answers by half a pixel.
-    ``mirrors`` are the axes along which teachers see it mirrored: what they answer on average errs less.
+    ``mirrors`` are the axes along which teachers see it mirrored, one of ``UPRIGHT`` among them: what they answer on
+    average errs less.
     """
 
     image: Tensor
@@ -116,7 +119,7 @@ def told_by(teachers: Sequence[Pair], batch: Batch) -> tuple[BlurEstimate, Depth
         blurs, depths = zip(*(run_pair(teacher, view) for teacher in teachers for view in seen), strict=True)
         blur_px = torch.exp(mean(torch.log(blur.blur_px) for blur in blurs))
         upright = (
-            depth.near_logit.flip(mirror) for depth, mirror in zip(depths, mirrors, strict=True) if 2 not in mirror
+            depth.near_logit.flip(mirror) for depth, mirror in zip(depths, mirrors, strict=True) if mirror in UPRIGHT
         )
         depth = DepthEstimate(
             mean(depth.log_ratio_near for depth in depths),

@@ -27,7 +27,7 @@ from model_export.config import Kind, Learning, SceneConfig, TrainConfig
 from model_export.cores import computes_bfloat16, torch_threads
 from model_export.folded import folded
 from model_export.frames import load_frames
-from model_export.losses import Batch, Mirror, run_pair, total_loss
+from model_export.losses import UPRIGHT, UPSIDE_DOWN, Batch, run_pair, total_loss
 from model_export.networks import SHIPPED_WIDTHS, CompactDepth, Pair, Widths, make_pair, with_fresh_decoders
 from model_export.optimizers import Optimizers
 from model_export.progress import progress_bar
@@ -40,9 +40,6 @@ FOCAL_UNKNOWN_SHARE = 0.3
 # a camera known by its specs has a guess for gamma: mostly too low a one, since motion, haze and filters add softness
 GUESSED_GAMMA_SHARE, GUESSED_GAMMA = 0.6, (-0.2, 0.35)  # mean and standard deviation of the guess's log error
 HELD_OUT_SEED = 2**40
-# one of each is shown to teachers: four times as many views would cost more than the step itself
-UPRIGHT: tuple[Mirror, Mirror] = ((), (3,))
-UPSIDE_DOWN: tuple[Mirror, Mirror] = ((2,), (2, 3))
 UNCHANGED = TrainConfig()
 
 
@@ -137,6 +134,7 @@ def collate(samples: list[Sample], rng: np.random.Generator, config: TrainConfig
     image = torch.from_numpy(np.stack(images)).float() / 255
     excess = torch.from_numpy(np.stack(excesses))[:, None]
     place = (rng.random(), rng.random())
+    # all four would cost teachers more than the step itself
     mirrors = (UPRIGHT[rng.integers(2)], UPSIDE_DOWN[rng.integers(2)])
     return Batch(image.contiguous(memory_format=torch.channels_last), excess, *columns, place=place, mirrors=mirrors)
 

@@ -319,11 +319,8 @@ def test_two_threads_get_the_answer_of_one(estimator: Estimator) -> None:
         assert found[level] == pytest.approx(thin_lens.depth_near(expected_x(level), 2.0), rel=1e-4)
 
 
-def test_a_part_is_read_with_its_surroundings_and_no_more(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    estimator = Estimator.from_folder(load_model_folder(folder))
-    rgb = np.random.default_rng(0).integers(40, 130, (900, 1200, 3), np.uint8)
-    camera = Camera(1200, 900, 2.0, 4.0, 0.5)
-    whole, part = estimator.estimate(rgb, camera, "near"), Part(500, 400, 560, 430)
+def tiles_seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
+    """The shapes of what the blur graph is shown from here on."""
     seen: list[tuple[int, ...]] = []
     see = GraphPair.see
 
@@ -332,6 +329,15 @@ def test_a_part_is_read_with_its_surroundings_and_no_more(folder: Path, monkeypa
         return see(pair, tile, cancellation)
 
     monkeypatch.setattr(GraphPair, "see", noting)
+    return seen
+
+
+def test_a_part_is_read_with_its_surroundings_and_no_more(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    estimator = Estimator.from_folder(load_model_folder(folder))
+    rgb = np.random.default_rng(0).integers(40, 130, (900, 1200, 3), np.uint8)
+    camera = Camera(1200, 900, 2.0, 4.0, 0.5)
+    whole, part = estimator.estimate(rgb, camera, "near"), Part(500, 400, 560, 430)
+    seen = tiles_seen(monkeypatch)
     answer = estimator.estimate(rgb, camera, "near", part=part)
     np.testing.assert_allclose(answer.depth_m, part.of(whole.depth_m), rtol=1e-5)
     assert (answer.width_px, answer.height_px) == (60, 30)
@@ -356,14 +362,7 @@ def test_a_part_of_strong_blur_is_read_on_smaller_copies_of_more_that_surrounds_
     rgb = np.repeat((down[:, np.newaxis] + across).round().astype(np.uint8)[..., np.newaxis], 3, axis=2)
     camera = Camera(size[1], size[0], 2.0, k_cam_px)
     whole = halving.estimate(rgb, camera, "near")
-    seen: list[tuple[int, ...]] = []
-    see = GraphPair.see
-
-    def noting(pair: GraphPair, tile: NDArray[np.uint8], cancellation: Cancellation) -> RawMaps:
-        seen.append(tile.shape)
-        return see(pair, tile, cancellation)
-
-    monkeypatch.setattr(GraphPair, "see", noting)
+    seen = tiles_seen(monkeypatch)
     answer = halving.estimate(rgb, camera, "near", part=part)
     assert answer.scales == pytest.approx(whole.scales, rel=0.01)
     assert len(seen) == 3
