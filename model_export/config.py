@@ -61,7 +61,8 @@ class TrainConfig:
     them in a run that begins with weights, decoders' too. A ``taught`` run learns teachers' answers too, the side of
     focus among them where ``side_weight`` is 0. ``learning`` is what moves: all or the depth network alone, either
     without what tells the side by the layout, or that alone. Of the pictures ``turned_share`` do not stay upright, and
-    for ``hint_share`` a side is asked for.
+    for ``hint_share`` a side is asked for. With ``retaken`` the pool holds scenes, not pictures: each batch takes
+    pictures of its own of them, where steps are computed (``darkroom.py``).
     """
 
     kind: Kind = "compact"
@@ -80,6 +81,7 @@ class TrainConfig:
     likeness_weight: float = 10.0
     pool: int = 600
     fresh_per_step: float = 1.0
+    retaken: bool = False
     turned_share: float = 0.3
     hint_share: float = 0.5
     checkpoint_every: int = 250

@@ -1,7 +1,7 @@
 """What training minimises: L_depth + b_weight * L_blur (eq. 8), each a likelihood, so that errors are stated."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, fields, replace
 
 import torch
 from torch import Tensor
@@ -51,6 +51,15 @@ class Batch:
     place: tuple[float, float] = field(default=(0.0, 0.0), kw_only=True)
     mirrors: tuple[Mirror, ...] = field(default=((),), kw_only=True)
 
+    def tensors(self) -> list[Tensor]:
+        """All that a device holds of it."""
+        values = (getattr(self, each.name) for each in fields(self))
+        return [value for value in values if isinstance(value, Tensor)]
+
+    def changed(self, change: Callable[[Tensor], Tensor]) -> "Batch":
+        """With every tensor changed."""
+        return Batch(*map(change, self.tensors()), place=self.place, mirrors=self.mirrors)
+
     def scene(self) -> Scene:
         return Scene(self.focus_distance_m, self.focal_length_px, self.side)
 
@@ -88,7 +97,7 @@ def reduced(excess: Tensor, stride: int, place: tuple[float, float]) -> Tensor:
     return excess[:, :, down::stride, across::stride]
 
 
-def standing_out(log_truth: Tensor, emphasis: float = 1.0) -> Tensor:
+def standing_out(log_truth: Tensor, emphasis: float | Tensor = 1.0) -> Tensor:
     """Weights [n,1,h,w] of mean 1: up to four times as much where the truth is unlike the mean of what is around.
 
     Most pixels are like their surroundings, so that to answer those everywhere costs little: a chair becomes the wall.
@@ -149,7 +158,7 @@ def likeness_loss(
 
 
 def total_loss(
-    pair: Pair, batch: Batch, config: TrainConfig, teachers: Sequence[Pair] = (), emphasis: float = 0.0
+    pair: Pair, batch: Batch, config: TrainConfig, teachers: Sequence[Pair] = (), emphasis: float | Tensor = 0.0
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The loss of a batch and its parts by name, all float32 scalars; the teachers' part is ``likeness_weight``.
 

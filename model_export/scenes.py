@@ -82,10 +82,25 @@ class Sample:
     shot: Shot
 
 
+@dataclass(frozen=True, slots=True)
+class Negative:
+    """A scene whose picture is still to be taken (``darkroom.py``), by a camera about that of ``shot``.
+
+    ``surfaces`` [layers,5,h,w] in float16 are premultiplied linear colour, alpha and q - 1, nearest first, ``ends``
+    [2,layers] the least and greatest q - 1 of each; ``softness`` is the variance (px^2) of the blur that they have
+    themselves.
+    """
+
+    surfaces: torch.Tensor
+    ends: Map
+    shot: Shot
+    softness: float
+
+
 NOTHING = Material()
 
 
-def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float], lean: float = 1.0) -> float:
+def log_uniform(rng: np.random.Generator, bounds: tuple[float, float], lean: float = 1.0) -> float:
     """Between the bounds, uniform in the logarithm; a ``lean`` below 1 leans to the upper one."""
     low, high = math.log(bounds[0]), math.log(bounds[1])
     return math.exp(low + (high - low) * rng.random() ** lean)
@@ -104,24 +119,24 @@ def _nearer_share(focus_distance_m: float) -> float:
 
 def draw_shot(rng: np.random.Generator, config: SceneConfig) -> Shot:
     """A random camera, focus distance, lens and side of focus within the config's ranges."""
-    focus_distance_m = _log_uniform(rng, config.focus_distance_m)
+    focus_distance_m = log_uniform(rng, config.focus_distance_m)
     side = 0 if rng.random() < BOTH_SIDES_SHARE else -1 if rng.random() < _nearer_share(focus_distance_m) else 1
-    k_cam_px = _log_uniform(rng, config.k_cam_px, K_CAM_LEAN)
+    k_cam_px = log_uniform(rng, config.k_cam_px, K_CAM_LEAN)
     return Shot(
         k_cam_px=k_cam_px,
-        gamma_px=_log_uniform(rng, config.gamma_px),
+        gamma_px=log_uniform(rng, config.gamma_px),
         focus_distance_m=focus_distance_m,
-        focal_length_px=_log_uniform(rng, config.focal_length_px),
-        spread=_draw_spread(rng, k_cam_px),
+        focal_length_px=log_uniform(rng, config.focal_length_px),
+        spread=draw_spread(rng, k_cam_px),
         side=side,
         depth_ratio=(
-            _log_uniform(rng, (config.depth_ratio[0], NEAREST_AT_MOST)),
-            _log_uniform(rng, (FARTHEST_AT_LEAST, config.depth_ratio[1])),
+            log_uniform(rng, (config.depth_ratio[0], NEAREST_AT_MOST)),
+            log_uniform(rng, (FARTHEST_AT_LEAST, config.depth_ratio[1])),
         ),
     )
 
 
-def _draw_spread(rng: np.random.Generator, k_cam_px: float) -> PointSpread:
+def draw_spread(rng: np.random.Generator, k_cam_px: float) -> PointSpread:
     """A Gaussian, a disc or between; sometimes squeezed; sometimes red and blue focused elsewhere than green.
 
     Most lenses are achromats, which focus green nearest to the lens: red and blue are blurrier than green before the
@@ -153,7 +168,7 @@ def _draw_excess(rng: np.random.Generator, shot: Shot, config: SceneConfig) -> f
     if rng.random() < FOCUSED_SHARE:
         amount = rng.uniform(0, first)
     else:
-        amount = rng.uniform(0, end) if rng.random() < 0.5 else _log_uniform(rng, (first, end))
+        amount = rng.uniform(0, end) if rng.random() < 0.5 else log_uniform(rng, (first, end))
     return -amount if far else amount
 
 
@@ -278,8 +293,8 @@ def develop(
 ) -> NDArray[np.uint8]:
     """Light on the sensor [h,w,3] to a JPEG's pixels: exposure, noise, demosaic, white balance, tone, sharpening."""
     picture = linear * rng.uniform(0.5, 1.4) / max(float(np.quantile(linear, 0.98)), 0.2)
-    shot_noise = _log_uniform(rng, GRAIN if rng.random() < GRAINY_SHARE else SHOT_NOISE)
-    read_noise = _log_uniform(rng, READ_NOISE)
+    shot_noise = log_uniform(rng, GRAIN if rng.random() < GRAINY_SHARE else SHOT_NOISE)
+    read_noise = log_uniform(rng, READ_NOISE)
     noise = rng.standard_normal(picture.shape).astype(np.float32)
     if not through_mosaic and _by_chance(rng, config.grey_share):  # as denoisers leave it, and ray tracing makes it
         noise[:] = noise[..., :1]
@@ -362,6 +377,19 @@ def draw_sample(seed: int, config: SceneConfig, material: Material = NOTHING) ->
     pixels = np.ascontiguousarray(np.asarray(small, np.uint8).transpose(2, 0, 1))
     gamma_px = thin_lens.gamma_after_averaging(taken.gamma_px, larger_px, size)
     return Sample(pixels, np.asarray(told, np.float16), replace(shot, gamma_px=gamma_px))
+
+
+def draw_negative(seed: int, config: SceneConfig, material: Material = NOTHING) -> Negative:
+    """The surfaces of this seed, before any lens; the same seed, config and material give the same."""
+    rng = np.random.default_rng(seed)
+    shot, softness = draw_shot(rng, config), 0.0
+    if material.frames and rng.random() < config.frame_share:
+        shot, layers, excesses, softness = _frame_layers(rng, shot, config, draw_frame(rng, material.frames))
+    else:
+        layers, excesses = draw_layers(rng, shot, config, material.photographs)
+    parts = zip(layers, torch.from_numpy(excesses), strict=True)
+    surfaces = torch.stack([torch.cat([layer.color, layer.alpha, excess[None]]) for layer, excess in parts])
+    return Negative(surfaces.half(), np.stack([excesses.min((1, 2)), excesses.max((1, 2))]), shot, softness)
 
 
 def _photograph(

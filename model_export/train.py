@@ -8,23 +8,26 @@ import math
 import os
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from queue import Queue
+from threading import Thread
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from rich.console import Console
-from torch import nn
+from torch import Tensor, nn
 from torch.nn.utils import convert_conv2d_weight_memory_format
 from torch.utils.data import DataLoader, Dataset
 
 from model_export.config import Kind, Learning, SceneConfig, TrainConfig
 from model_export.cores import computes_bfloat16, torch_threads
+from model_export.darkroom import photograph, sent
 from model_export.folded import folded
 from model_export.frames import load_frames
 from model_export.losses import UPRIGHT, UPSIDE_DOWN, Batch, run_pair, total_loss
@@ -32,7 +35,7 @@ from model_export.networks import SHIPPED_WIDTHS, CompactDepth, Pair, Widths, ma
 from model_export.optimizers import Optimizers
 from model_export.progress import progress_bar
 from model_export.restored import restored, spread_norms
-from model_export.scenes import Material, Sample, draw_sample
+from model_export.scenes import Material, Negative, Sample, Shot, draw_negative, draw_sample
 from model_export.textures import load_photographs
 from service.cores import available_cores
 
@@ -41,10 +44,14 @@ FOCAL_UNKNOWN_SHARE = 0.3
 GUESSED_GAMMA_SHARE, GUESSED_GAMMA = 0.6, (-0.2, 0.35)  # mean and standard deviation of the guess's log error
 HELD_OUT_SEED = 2**40
 UNCHANGED = TrainConfig()
+AHEAD = 64
+MOST_HELD_OUT = 32
+
+Drawn = Sample | Negative
 
 
-class SceneStream(Dataset[Sample]):
-    """Scene number ``start + i`` of a run, drawn in a worker process."""
+class SceneStream(Dataset[Drawn]):
+    """Scene number ``start + i`` of a run, drawn in a worker process: its picture, or the scene itself."""
 
     def __init__(self, config: TrainConfig, material: Material, start: int, end: int) -> None:
         self.config, self.material = config, material
@@ -53,9 +60,10 @@ class SceneStream(Dataset[Sample]):
     def __len__(self) -> int:
         return self.end - self.start
 
-    def __getitem__(self, index: int) -> Sample:
+    def __getitem__(self, index: int) -> Drawn:
         seed = self.config.seed * 2**32 + self.start + index
-        return draw_sample(seed, self.config.scenes, self.material)
+        draw = draw_negative if self.config.retaken else draw_sample
+        return draw(seed, self.config.scenes, self.material)
 
 
 def _worker_start(_: int) -> None:
@@ -64,28 +72,54 @@ def _worker_start(_: int) -> None:
     os.nice(19)  # steps come first where cores are shared
 
 
-def scene_stream(config: TrainConfig, material: Material, start: int, end: int, workers: int) -> Iterator[Sample]:
+def scene_stream(config: TrainConfig, material: Material, start: int, end: int, workers: int) -> Iterator[Drawn]:
     """Scenes ``start`` to ``end`` in order, drawn ahead by worker processes (0: in this one)."""
     stream = SceneStream(config, material, start, end)
-    loader: DataLoader[Sample] = DataLoader(
+    loader: DataLoader[Drawn] = DataLoader(
         stream,
         batch_size=None,
         num_workers=workers,
         worker_init_fn=_worker_start,
-        prefetch_factor=64 if workers else None,
+        prefetch_factor=max(8, 64 // workers) if workers else None,
         multiprocessing_context="forkserver" if workers else None,
     )
     return iter(loader)
 
 
+def arriving(stream: Iterator[Drawn], device: torch.device) -> Iterator[Drawn]:
+    """The stream, its scenes on a CUDA device: brought there by a thread of its own, some ahead, beside all else."""
+    waiting: Queue[Drawn | Exception | None] = Queue(AHEAD)
+
+    def bring() -> None:
+        beside = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+        try:
+            with torch.cuda.stream(beside):
+                for drawn in stream:
+                    moved = replace(drawn, surfaces=drawn.surfaces.to(device)) if isinstance(drawn, Negative) else drawn
+                    beside.synchronize()
+                    waiting.put(moved)
+            waiting.put(None)
+        except Exception as exc:
+            waiting.put(exc)
+
+    Thread(target=bring, daemon=True).start()
+    while (drawn := waiting.get()) is not None:
+        if isinstance(drawn, Exception):
+            raise drawn
+        if isinstance(drawn, Negative):
+            drawn.surfaces.record_stream(torch.cuda.current_stream(device))
+        yield drawn
+
+
 class Pool:
     """The last ``pool`` scenes of the stream; ``fresh_per_step`` new ones come in after every batch, on average."""
 
-    def __init__(self, config: TrainConfig, material: Material, step: int, workers: int) -> None:
-        self.config = config
+    def __init__(self, config: TrainConfig, material: Material, step: int, workers: int, device: str = "cpu") -> None:
+        self.config, self.device = config, torch.device(device)
         first = self._drawn(step) - config.pool
-        self.stream = scene_stream(config, material, first, self._drawn(config.steps) + 1, workers)
-        self.samples: deque[Sample] = deque(maxlen=config.pool)
+        stream = scene_stream(config, material, first, self._drawn(config.steps) + 1, workers)
+        self.stream = arriving(stream, self.device) if self.device.type == "cuda" else stream
+        self.samples: deque[Drawn] = deque(maxlen=config.pool)
 
     def _drawn(self, step: int) -> int:
         """How many scenes have come in before ``step``: a full pool first, then the steady flow."""
@@ -100,8 +134,11 @@ class Pool:
     def batch(self, step: int) -> Batch:
         """The batch of a step: scenes, flips, hints and all follow from seed and step."""
         rng = np.random.default_rng((self.config.seed, step))
-        chosen = rng.integers(0, len(self.samples), self.config.batch)
-        return collate([self.samples[i] for i in chosen], rng, self.config)
+        chosen = [self.samples[i] for i in rng.integers(0, len(self.samples), self.config.batch)]
+        negatives = [drawn for drawn in chosen if isinstance(drawn, Negative)]
+        if negatives:
+            return collate_retaken(negatives, rng, self.config, self.device)
+        return collate([drawn for drawn in chosen if isinstance(drawn, Sample)], rng, self.config)
 
     def settling(self) -> Iterator[Batch]:
         """Batches of the pool as it is that no step draws, for batch norms to settle on."""
@@ -121,18 +158,45 @@ def collate(samples: list[Sample], rng: np.random.Generator, config: TrainConfig
     """
     images, excesses, rows = [], [], []
     for sample in samples:
-        turns = int(rng.integers(4)) if rng.random() < config.turned_share else 0
-        flip = int(rng.choice([-1, 1]))
+        turns, flip = _turn(rng, config)
         images.append(np.rot90(sample.image, turns, (1, 2))[:, :, ::flip].copy())
         excesses.append(np.rot90(sample.excess, turns)[:, ::flip].astype(np.float32))
-        shot = sample.shot
-        focal = 0.0 if rng.random() < FOCAL_UNKNOWN_SHARE else shot.focal_length_px
-        side = (shot.side or int(rng.choice([-1, 1]))) if rng.random() < config.hint_share else 0
-        guess = math.exp(rng.normal(*GUESSED_GAMMA)) if rng.random() < GUESSED_GAMMA_SHARE else 1.0
-        rows.append((shot.k_cam_px, shot.gamma_px, guess * shot.gamma_px, shot.focus_distance_m, focal, side))
-    columns = torch.tensor(rows, dtype=torch.float32).unbind(1)
+        rows.append(_told(rng, sample.shot, config))
     image = torch.from_numpy(np.stack(images)).float() / 255
-    excess = torch.from_numpy(np.stack(excesses))[:, None]
+    return _batch(rng, image, torch.from_numpy(np.stack(excesses))[:, None], rows)
+
+
+def collate_retaken(
+    negatives: Sequence[Negative], rng: np.random.Generator, config: TrainConfig, device: torch.device
+) -> Batch:
+    """The same of pictures that are taken now, on the device."""
+    with torch.autocast(device.type, enabled=False):
+        image, excess, shots = photograph(rng, negatives, config, device)
+    turns, flips = zip(*(_turn(rng, config) for _ in negatives), strict=True)
+    both = torch.cat([image, excess], 1)
+    for turn in (1, 2, 3):
+        chosen = sent(np.flatnonzero(np.array(turns) == turn), device)
+        both[chosen] = torch.rot90(both[chosen], turn, (2, 3))
+    flipped = sent(np.array(flips) < 0, device)[:, None, None, None]
+    both = torch.where(flipped, both.flip(3), both)
+    return _batch(rng, both[:, :3], both[:, 3:], [_told(rng, shot, config) for shot in shots])
+
+
+def _turn(rng: np.random.Generator, config: TrainConfig) -> tuple[int, int]:
+    """How many quarters a picture is turned, and -1 if it is mirrored."""
+    return int(rng.integers(4)) if rng.random() < config.turned_share else 0, int(rng.choice([-1, 1]))
+
+
+def _told(rng: np.random.Generator, shot: Shot, config: TrainConfig) -> tuple[float, ...]:
+    """A shot as a batch has it: k_cam, gamma, the gamma that is told, focus distance, focal length and side."""
+    focal = 0.0 if rng.random() < FOCAL_UNKNOWN_SHARE else shot.focal_length_px
+    side = (shot.side or int(rng.choice([-1, 1]))) if rng.random() < config.hint_share else 0
+    guess = math.exp(rng.normal(*GUESSED_GAMMA)) if rng.random() < GUESSED_GAMMA_SHARE else 1.0
+    return (shot.k_cam_px, shot.gamma_px, guess * shot.gamma_px, shot.focus_distance_m, focal, side)
+
+
+def _batch(rng: np.random.Generator, image: Tensor, excess: Tensor, rows: Sequence[tuple[float, ...]]) -> Batch:
+    columns = sent(torch.tensor(rows, dtype=torch.float32), image.device).unbind(1)
     place = (rng.random(), rng.random())
     # all four would cost teachers more than the step itself
     mirrors = (UPRIGHT[rng.integers(2)], UPSIDE_DOWN[rng.integers(2)])
@@ -242,6 +306,33 @@ def settling_step(config: TrainConfig) -> int:
     return round(config.steps * (1 - config.settled_share))
 
 
+class Recorded:
+    """What a step does to a batch of one shape, as one CUDA graph."""
+
+    def __init__(self, gradients: Callable[[Batch, Tensor], dict[str, Tensor]], batch: Batch, memory: Any) -> None:
+        device = batch.image.device
+        self.batch = batch.changed(torch.clone)
+        self.weight = torch.zeros((), device=device)
+        beside, current = torch.cuda.Stream(device), torch.cuda.current_stream(device)  # type: ignore[no-untyped-call]
+        beside.wait_stream(current)
+        with torch.cuda.stream(beside):  # libraries choose their kernels
+            for _ in range(3):
+                gradients(self.batch, self.weight)
+        current.wait_stream(beside)
+        self.graph = torch.cuda.CUDAGraph()
+        # another thread moves scenes to the device meanwhile
+        with torch.cuda.graph(self.graph, pool=memory, capture_error_mode="thread_local"):
+            self.parts = gradients(self.batch, self.weight)
+
+    def replay(self, batch: Batch, weight: float) -> dict[str, Tensor]:
+        """The gradients of another batch; its loss's parts."""
+        self.weight.fill_(weight)
+        for own, other in zip(self.batch.tensors(), batch.tensors(), strict=True):
+            own.copy_(other)
+        self.graph.replay()
+        return {name: part.clone() for name, part in self.parts.items()}
+
+
 class Trainer:
     """Networks, optimiser and step of one run on one device."""
 
@@ -264,6 +355,8 @@ class Trainer:
             self.pair.depth.lays_out = config.learning == "layout"
         self.optimizers = Optimizers(self.modules, config.weight_decay)
         self.teachers: list[Pair] = []
+        self.recorded: dict[object, Recorded] = {}
+        self.memory = torch.cuda.graph_pool_handle() if self.device.type == "cuda" else None  # one at a time uses it
         self.step = 0
         if resume is not None:
             if not resume.optimizers:
@@ -284,25 +377,47 @@ class Trainer:
             if isinstance(teacher.depth, CompactDepth):
                 teacher.depth.lays_out = False  # nor is the layout seen in what learns
 
+    def moved(self, values: Tensor) -> Tensor:
+        """To where steps are computed."""
+        return values.to(self.device)
+
     def autocast(self) -> torch.autocast:
         """bfloat16 where the hardware computes it; emulated on an older processor it is ten times slower."""
         return torch.autocast(self.device.type, torch.bfloat16, enabled=computes_bfloat16(self.device))
 
-    def advance(self, batch: Batch) -> dict[str, float]:
+    def advance(self, batch: Batch) -> dict[str, Tensor]:
         """One optimiser step on a batch; the loss's parts."""
         self.modules.eval()
         self.learning.train()
         if self.step >= settling_step(self.config):
             for norm in self._norms():
                 norm.eval()
-        with self.autocast():
-            loss, parts = total_loss(self.pair, batch, self.config, self.teachers, emphasis(self.config, self.step))
-        self.modules.zero_grad(set_to_none=True)
-        torch.autograd.backward(loss)
-        nn.utils.clip_grad_norm_(self.modules.parameters(), self.config.clip_norm)
+        weight = emphasis(self.config, self.step)
+        parts = self._replayed(batch, weight) if self.device.type == "cuda" else self._gradients(batch, weight)
         self.optimizers.step(learning_rate(self.config, self.step))
         self.step += 1
-        return {name: float(part) for name, part in parts.items()}
+        return parts
+
+    def _gradients(self, batch: Batch, weight: float | Tensor) -> dict[str, Tensor]:
+        """Gradients of a batch's loss, clipped, in place of those before; the loss's parts."""
+        for parameter in self.learning.parameters():
+            if parameter.grad is None:
+                parameter.grad = torch.zeros_like(parameter)
+        torch._foreach_zero_([p.grad for p in self.learning.parameters() if p.grad is not None])
+        with self.autocast():
+            loss, parts = total_loss(self.pair, batch, self.config, self.teachers, weight)
+        torch.autograd.backward(loss)
+        nn.utils.clip_grad_norm_(self.learning.parameters(), self.config.clip_norm)
+        return parts
+
+    def _replayed(self, batch: Batch, weight: float) -> dict[str, Tensor]:
+        """The same on a CUDA device, recorded once for each kind of step: its thousands of kernels start as one."""
+        norms_move = self.step < settling_step(self.config)
+        cell = tuple(int(part * self.pair.stride) for part in batch.place)
+        kind = (norms_move, cell, batch.mirrors if self.teachers else ())
+        if kind not in self.recorded:
+            self.recorded[kind] = Recorded(self._gradients, batch, self.memory)
+        return self.recorded[kind].replay(batch, weight)
 
     def _norms(self) -> list[nn.BatchNorm2d]:
         return [m for m in self.learning.modules() if isinstance(m, nn.BatchNorm2d)]
@@ -382,8 +497,8 @@ def train(
     path = run / "checkpoint.pt"
     trainer, start = _opened(config, path, weights, teachers, device, fresh_decoders=fresh_decoders)
     config = trainer.config
-    pool = Pool(config, material, trainer.step, workers)
-    test = held_out(config.scenes, material, 2 * config.batch)
+    pool = Pool(config, material, trainer.step, workers, device)
+    test = held_out(config.scenes, material, min(2 * config.batch, MOST_HELD_OUT)).changed(trainer.moved)
     # by itself not on a core with a worker: two busy processes there cost each far more than half its speed
     with torch_threads(threads or max(1, available_cores() - workers)), progress_bar(console) as progress:
         for _ in progress.track(pool.fill(), total=config.pool, description="scenes"):
@@ -403,7 +518,7 @@ def train(
 def _steps(trainer: Trainer, pool: Pool, test: Batch, path: Path) -> Iterator[str | None]:
     """Take the steps that a run has left, one at a time; what there is to say where a checkpoint was saved."""
     config, pace = trainer.config, Pace()
-    recent: list[dict[str, float]] = []
+    recent: list[dict[str, Tensor]] = []
     while trainer.step < config.steps:
         if trainer.step == settling_step(config) > 0:
             trainer.settle(pool.settling())
@@ -450,9 +565,9 @@ def _opened(
     return trainer, start
 
 
-def _report(trainer: Trainer, recent: list[dict[str, float]], test: Batch, pace: Pace) -> str:
+def _report(trainer: Trainer, recent: list[dict[str, Tensor]], test: Batch, pace: Pace) -> str:
     """A line on the recent steps: their losses beside those on held-out scenes, and how fast they went."""
     held_out_parts = trainer.validate(test)
-    mean = {name: sum(parts[name] for parts in recent) / len(recent) for name in held_out_parts}
+    mean = {name: float(torch.stack([parts[name] for parts in recent]).mean()) for name in held_out_parts}
     figures = "  ".join(f"{name} {mean[name]:.3f} (held out {held_out_parts[name]:.3f})" for name in mean)
     return f"step {trainer.step}: {figures}  {pace.told(len(recent), trainer.config.fresh_per_step)}"
