@@ -71,13 +71,46 @@ FROM_YCBCR = ((1.0, 0.0, 1.402), (1.0, -0.344136, -0.714136), (1.0, 1.772, 0.0))
 Numbers = NDArray[np.float64]
 
 
-def sampled_parameter(variance: Numbers) -> Numbers:
-    """The parameters of the sampled Gaussians that have these variances below ``SAMPLED_BELOW_VARIANCE``."""
+def sent(values: NDArray[Any] | Tensor, device: torch.device) -> Tensor:
+    """Numbers on the device, without waiting for what it has still to do."""
+    tensor = values if isinstance(values, Tensor) else torch.from_numpy(np.ascontiguousarray(values))
+    return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor
+
+
+@lru_cache
+def _constant(values: tuple[Any, ...], device: torch.device) -> Tensor:
+    """The same, once for all."""
+    return torch.tensor(values, dtype=torch.float32).to(device)
+
+
+def _columns(device: torch.device, *values: NDArray[Any]) -> tuple[Tensor, ...]:
+    """Numbers [n] each to go with maps, [n,1,1] each, sent together: to send costs more than what is sent."""
+    return sent(np.stack(values).astype(np.float32), device)[:, :, None, None].unbind()
+
+
+@lru_cache
+def _sampled_parameters() -> tuple[Numbers, Numbers]:
+    """Variances of sampled Gaussians, and their parameters."""
     parameters = np.concatenate([[1e-4], np.linspace(0.02, 2 * SAMPLED_BELOW_VARIANCE, 4000)])
     x2 = np.arange(1, SAMPLED_TAPS + 1) ** 2
     weights = np.exp(-x2 / (2 * parameters[:, None]))
-    found = 2 * (weights * x2).sum(1) / (1 + 2 * weights.sum(1))
-    return np.asarray(np.interp(variance, found, parameters))
+    return 2 * (weights * x2).sum(1) / (1 + 2 * weights.sum(1)), parameters
+
+
+def sampled_taps(variance: Numbers) -> Numbers:
+    """What the sampled Gaussians of these variances [n] weigh at 0, 1, ... px [n,taps], both sides together."""
+    parameter = np.interp(variance, *_sampled_parameters())
+    weights = np.exp(-(np.arange(SAMPLED_TAPS + 1) ** 2) / (2 * parameter[:, None]))
+    weights[:, 1:] *= 2
+    return np.asarray(weights / weights.sum(1, keepdims=True))
+
+
+@lru_cache
+def _frequencies(height: int, width: int, device: torch.device) -> tuple[tuple[Tensor, Tensor], ...]:
+    """Down and across: cycles per pixel [f] of a spectrum, and their cosines at 0, 1, ... px [taps,f]."""
+    both = torch.fft.fftfreq(height), torch.fft.rfftfreq(width)
+    offsets = torch.arange(SAMPLED_TAPS + 1)[:, None]
+    return tuple((f.to(device), torch.cos(2 * math.pi * offsets * f).to(device)) for f in both)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,57 +125,26 @@ class Spreads:
         return Spreads(self.disc_share[items], self.squeeze[items], self.angle[items])
 
 
-def sent(values: NDArray[Any] | Tensor, device: torch.device) -> Tensor:
-    """Numbers on the device, without waiting for what it has still to do."""
-    tensor = values if isinstance(values, Tensor) else torch.from_numpy(np.ascontiguousarray(values))
-    return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor
-
-
-@lru_cache
-def _constant(values: tuple[Any, ...], device: torch.device) -> Tensor:
-    """The same, once for all."""
-    return torch.tensor(values, dtype=torch.float32).to(device)
-
-
-def _column(values: NDArray[Any], device: torch.device) -> Tensor:
-    """Numbers [n] to go with maps: [n,1,1]."""
-    return sent(np.asarray(values, np.float32), device)[:, None, None]
-
-
-def _gaussian_transfer(frequency: Tensor, variance: Numbers) -> Tensor:
-    """As ``render.py`` has it, for [n] variances over frequencies [1,h,1] or [1,1,w]."""
-    device = frequency.device
-    smooth = torch.exp(-2 * math.pi**2 * _column(variance, device) * frequency**2)
-    narrow = variance < SAMPLED_BELOW_VARIANCE
-    if not narrow.any():
-        return smooth
-    parameter = _column(sampled_parameter(np.minimum(variance, SAMPLED_BELOW_VARIANCE)), device)
-    total, out = torch.ones_like(parameter), torch.ones_like(smooth)
-    for x in range(1, SAMPLED_TAPS + 1):
-        weight = torch.exp(-(x**2) / (2 * parameter))
-        total = total + 2 * weight
-        out = out + 2 * weight * torch.cos(2 * math.pi * x * frequency)
-    return torch.where(_column(narrow, device) > 0, out / total, smooth)
-
-
 def transfers(height: int, width: int, sigma_px: Numbers, spreads: Spreads, device: torch.device) -> Tensor:
     """Transfer functions [n,h,w//2+1] of point spreads with these standard deviations [n]."""
-    fy = torch.fft.fftfreq(height, device=device)[None, :, None]
-    fx = torch.fft.rfftfreq(width, device=device)[None, None, :]
     variance = sigma_px**2
-    gauss_variance = np.maximum((1 - spreads.disc_share) * variance, np.minimum(variance, SOFT_EDGE_VARIANCE))
-    gauss = _gaussian_transfer(fy, gauss_variance) * _gaussian_transfer(fx, gauss_variance)
-    is_disc = np.flatnonzero(gauss_variance < variance)
-    if not is_disc.size:
-        return gauss
-    some = spreads.of(is_disc)
-    longer_px = 2 * np.sqrt((variance - gauss_variance)[is_disc] * 2 / (1 + some.squeeze**2))
-    cos, sin = _column(np.cos(some.angle), device), _column(np.sin(some.angle), device)
-    along, across = fx * cos + fy * sin, _column(some.squeeze, device) * (fy * cos - fx * sin)
-    t = (2 * math.pi * _column(longer_px, device) * torch.sqrt(along**2 + across**2)).clamp_min(1e-4)
-    at = sent(is_disc, device)
-    gauss[at] *= 2 * torch.special.bessel_j1(t) / t
-    return gauss
+    of_gauss = np.maximum((1 - spreads.disc_share) * variance, np.minimum(variance, SOFT_EDGE_VARIANCE))
+    longer_px = 2 * np.sqrt(np.maximum(variance - of_gauss, 0) * 2 / (1 + spreads.squeeze**2))
+    told = (of_gauss, of_gauss < SAMPLED_BELOW_VARIANCE, longer_px, np.cos(spreads.angle), np.sin(spreads.angle))
+    gauss, narrow, longer, cos, sin, squeeze = _columns(device, *told, spreads.squeeze)
+    taps = sent(sampled_taps(of_gauss).astype(np.float32), device)
+    (fy, cosines_down), (fx, cosines_across) = _frequencies(height, width, device)
+
+    def along_axis(f: Tensor, cosines: Tensor) -> Tensor:
+        smooth = torch.exp(-2 * math.pi**2 * gauss[:, :, 0] * f**2)
+        return torch.where(narrow[:, :, 0] > 0, taps @ cosines, smooth)
+
+    both = along_axis(fy, cosines_down)[:, :, None] * along_axis(fx, cosines_across)[:, None]
+    fy = fy[:, None]
+    along, across = fx * cos + fy * sin, squeeze * (fy * cos - fx * sin)
+    t = (2 * math.pi * longer * torch.sqrt(along**2 + across**2)).clamp_min(1e-4)
+    disc: Tensor = 2 * torch.special.bessel_j1(t) / t
+    return both * disc
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,14 +183,16 @@ def blur_varying(images: Tensor, sigma_px: Tensor, bounds: tuple[Numbers, Number
         part = slice(start, start + step)
         item, level = levels.item[part], levels.sigma_px[part] ** 2
         at = sent(item, device)
-        weight = torch.ones(len(item), height, width, device=device)
+        slopes, firsts = [], []
         for other in (levels.below[part], levels.above[part]):
-            slope = np.nan_to_num(1 / (level - other**2))
-            first = np.where(np.isnan(other), 1, -slope * np.nan_to_num(other) ** 2)
-            weight = torch.minimum(weight, _column(slope, device) * variance[at] + _column(first, device))
+            slopes.append(np.nan_to_num(1 / (level - other**2)))
+            firsts.append(np.where(np.isnan(other), 1, -slopes[-1] * np.nan_to_num(other) ** 2))
+        rise, fall, first, last = _columns(device, *slopes, *firsts)
+        seen = variance[at]
+        weight = torch.minimum(rise * seen + first, fall * seen + last).clamp(0, 1)
         otf = transfers(height, width, levels.sigma_px[part], spreads.of(item), device)
         blurred = torch.fft.irfft2(spectra[at] * otf[:, None], s=(height, width))
-        out.index_add_(0, at, weight.clamp_min(0)[:, None] * blurred)
+        out.index_add_(0, at, weight[:, None] * blurred)
     return out
 
 
@@ -236,10 +240,11 @@ def _blurred(surfaces: _Surfaces, shots: Sequence[Shot]) -> tuple[Tensor, Tensor
             continue
         scene, at = surfaces.scene[items], sent(items, device)
         shift = shifts[scene, channels[0]]
-        signed = maps[at, 4] * _column(-k_cam_px[scene], device) + _column(shift, device)
+        gain, moved = _columns(device, -k_cam_px[scene], shift)
+        signed = maps[at, 4] * gain + moved
         edges = -k_cam_px[scene] * surfaces.ends[:, items] + shift
         least = np.where(edges[0] * edges[1] <= 0, 0, np.abs(edges).min(0))
-        seen = maps[at][:, (*channels, 3)]
+        seen = torch.stack([maps[at, channel] for channel in (*channels, 3)], 1)
         blurred = blur_varying(seen, signed.abs(), (least, np.abs(edges).max(0)), spreads.of(scene))
         for i, channel in enumerate(channels):
             color[at, channel], alpha[at, channel] = blurred[:, i], blurred[:, -1]
@@ -252,9 +257,10 @@ def render(surfaces: _Surfaces, shots: Sequence[Shot]) -> tuple[Tensor, Tensor]:
     size = (len(shots), 3, *color.shape[2:])
     picture, clear = torch.zeros(size, device=color.device), torch.ones(size, device=color.device)
     most, excess = (torch.full((len(shots), *color.shape[2:]), -math.inf, device=color.device) for _ in range(2))
-    for rank in range(int(surfaces.rank.max()) + 1):
-        items = np.flatnonzero(surfaces.rank == rank)
-        at, of = (sent(index, color.device) for index in (items, surfaces.scene[items]))
+    order = np.argsort(surfaces.rank, kind="stable")
+    ranks = np.bincount(surfaces.rank).tolist()
+    both = sent(np.stack([order, surfaces.scene[order]]), color.device)
+    for at, of in (pair.unbind() for pair in torch.split(both, ranks, 1)):
         through = clear[of]
         picture.index_add_(0, of, through * color[at])
         share = through[:, 1] * alpha[at, 1]
@@ -268,9 +274,9 @@ def render(surfaces: _Surfaces, shots: Sequence[Shot]) -> tuple[Tensor, Tensor]:
 def _soften(maps: Tensor, sigma_px: Numbers, radius: int) -> Tensor:
     """Each of [n,c,h,w] blurred by a Gaussian of its own; what is beyond the border is mirrored."""
     n, c, h, w = maps.shape
-    offsets = torch.arange(-radius, radius + 1, device=maps.device)
-    taps = torch.exp(-0.5 * (offsets / _column(np.maximum(sigma_px, 0.05), maps.device)[:, 0]) ** 2)
-    taps = (taps / taps.sum(1, keepdim=True)).repeat_interleave(c, 0)
+    weights = np.exp(-0.5 * (np.arange(-radius, radius + 1) / np.maximum(sigma_px, 0.05)[:, None]) ** 2)
+    weights /= weights.sum(1, keepdims=True)
+    taps = sent(weights.astype(np.float32), maps.device).repeat_interleave(c, 0)
     flat = functional.pad(maps.reshape(1, n * c, h, w), (radius,) * 4, mode="reflect")
     flat = functional.conv2d(flat, taps[:, None, :, None], groups=n * c)
     return functional.conv2d(flat, taps[:, None, None, :], groups=n * c).reshape(n, c, h, w)
@@ -333,32 +339,37 @@ def develop(
     """Light on the sensor [n,3,h,w] to a JPEG's pixels in 0..255, as ``scenes.develop`` does."""
     n, device = len(linear), linear.device
 
-    def per_picture(values: NDArray[Any]) -> Tensor:
-        return _column(values, device)[:, None]
-
-    white = torch.quantile(linear[:, :, ::4, ::4].flatten(1), 0.98, dim=1).clamp_min(0.2)[:, None, None, None]
-    picture = linear * per_picture(rng.uniform(0.5, 1.4, n)) / white
     shot_noise = np.array([log_uniform(rng, GRAIN if rng.random() < GRAINY_SHARE else SHOT_NOISE) for _ in range(n)])
-    read_noise = np.exp(rng.uniform(*np.log(READ_NOISE), n))
-    grains = torch.randn(linear.shape, generator=noise, device=device)
-    grey = ~through_mosaic & (rng.random(n) < config.scenes.grey_share)
-    grains = torch.where(per_picture(grey) > 0, grains[:, :1], grains)
+    read_noise = np.array([log_uniform(rng, READ_NOISE) for _ in range(n)])
     spread = rng.uniform(0, 0.9, n)
-    filtered = ~through_mosaic & (spread > 0.3)
-    grains = _soften(grains, np.where(filtered, spread, 0), 4) * per_picture(1 + 1.5 * spread * filtered)
-    grains = grains * per_picture(rng.random(n) >= config.scenes.clean_share)
-    light = per_picture(shot_noise) * picture.clamp_min(0) + per_picture(read_noise**2)
-    picture = picture + grains * light.sqrt()
-    picture = torch.where(per_picture(through_mosaic) > 0, _through_mosaic(picture.clamp(0, 2)), picture)
+    filtered = ~through_mosaic & (spread > 0.3)  # filters make noise of neighbours alike
+    numbers = _columns(
+        device,
+        rng.uniform(0.5, 1.4, n),
+        shot_noise,
+        read_noise**2,
+        (1 + 1.5 * spread * filtered) * (rng.random(n) >= config.scenes.clean_share),
+        ~through_mosaic & (rng.random(n) < config.scenes.grey_share),
+        through_mosaic,
+        rng.uniform(-0.1, 0.35, n),
+        np.array([sharpening.amount for sharpening in sharpenings]),
+        rng.random(n) < PLAIN_SHARE,
+    )
+    exposure, shot, read, grain, grey, mosaic, bend, sharp, plain = (column[:, None] for column in numbers)
+    white = torch.quantile(linear[:, :, ::4, ::4].flatten(1), 0.98, dim=1).clamp_min(0.2)[:, None, None, None]
+    picture = linear * exposure / white
+    grains = torch.randn(linear.shape, generator=noise, device=device)
+    grains = _soften(torch.where(grey > 0, grains[:, :1], grains), np.where(filtered, spread, 0), 4) * grain
+    picture = picture + grains * (shot * picture.clamp_min(0) + read).sqrt()
+    picture = torch.where(mosaic > 0, _through_mosaic(picture.clamp(0, 2)), picture)
     picture = picture * sent(rng.uniform(0.85, 1.15, (n, 3, 1, 1)).astype(np.float32), device)
     encoded = _encoded(picture)
-    encoded = encoded + per_picture(rng.uniform(-0.1, 0.35, n)) * (encoded**2 * (3 - 2 * encoded) - encoded)
-    soft = _soften(encoded, np.array([s.spread_px for s in sharpenings]), 6)
-    encoded = encoded + per_picture(np.array([s.amount for s in sharpenings])) * (encoded - soft)
-    pixels = (encoded.clamp(0, 1) * 255).round()
+    encoded = encoded + bend * (encoded**2 * (3 - 2 * encoded) - encoded)
+    soft = _soften(encoded, np.array([sharpening.spread_px for sharpening in sharpenings]), 6)
+    pixels = ((encoded + sharp * (encoded - soft)).clamp(0, 1) * 255).round()
     low, high = config.scenes.jpeg_quality
     quality = sent(rng.integers(low, high + 1, n).astype(np.float32), device)
-    return torch.where(per_picture(rng.random(n) < PLAIN_SHARE) > 0, pixels, compressed(pixels, quality))
+    return torch.where(plain > 0, pixels, compressed(pixels, quality))
 
 
 def _areas(from_px: int, to_px: int) -> NDArray[np.float32]:

@@ -46,7 +46,7 @@ class Muon(torch.optim.Optimizer):
                         self._move(matrix, matrix.grad, group["lr"], group["weight_decay"])
         return loss
 
-    def _move(self, matrix: Tensor, gradient: Tensor, rate: float, decay: float) -> None:
+    def _move(self, matrix: Tensor, gradient: Tensor, rate: float | Tensor, decay: float) -> None:
         if not self.state[matrix]:
             self.state[matrix]["momentum_buffer"] = torch.zeros_like(matrix)
         momentum = self.state[matrix]["momentum_buffer"]
@@ -54,7 +54,7 @@ class Muon(torch.optim.Optimizer):
         dtype = torch.bfloat16 if computes_bfloat16(matrix.device) else torch.float32
         matrix.mul_(1 - rate * decay)
         step = RMS_OF_ADAMW * max(matrix.shape) ** 0.5 * rate
-        matrix.add_(evened(gradient.lerp(momentum, MOMENTUM), dtype), alpha=-step)
+        matrix.sub_(evened(gradient.lerp(momentum, MOMENTUM), dtype) * step)
 
 
 def _as_matrix(filters: Tensor) -> Tensor:
@@ -63,7 +63,10 @@ def _as_matrix(filters: Tensor) -> Tensor:
 
 
 class Optimizers:
-    """Both, as one. Filters larger than a pixel, whose memory must be channels last, are handed to Muon as matrices."""
+    """Both, as one. Filters larger than a pixel, whose memory must be channels last, are handed to Muon as matrices.
+
+    On a CUDA device the rate is a number there, so that a step can be recorded and done again at another rate.
+    """
 
     def __init__(self, modules: nn.Module, weight_decay: float) -> None:
         banks = [m for m in modules.modules() if isinstance(m, nn.Conv2d) and m.weight[0, 0].numel() > 1]
@@ -71,12 +74,13 @@ class Optimizers:
         self.matrices = [_as_matrix(filters.detach()) for filters in self.filters]
         kept = {id(filters) for filters in self.filters}
         others = [p for p in modules.parameters() if id(p) not in kept]
+        self.recordable = others[0].device.type == "cuda"
         self.both: tuple[torch.optim.Optimizer, ...] = (
             Muon(self.matrices, weight_decay),
-            torch.optim.AdamW(others, weight_decay=weight_decay),
+            torch.optim.AdamW(others, weight_decay=weight_decay, capturable=self.recordable),
         )
 
-    def step(self, learning_rate: float) -> None:
+    def step(self, learning_rate: float | Tensor) -> None:
         """Move the weights by their gradients."""
         for filters, matrix in zip(self.filters, self.matrices, strict=True):
             matrix.grad = None if filters.grad is None else _as_matrix(filters.grad)
@@ -86,9 +90,15 @@ class Optimizers:
             optimizer.step()
 
     def state_dict(self) -> list[dict[str, Any]]:
+        for optimizer in self.both:
+            for group in optimizer.param_groups:
+                group["lr"] = float(group["lr"])
         return [optimizer.state_dict() for optimizer in self.both]
 
     def load_state_dict(self, states: list[dict[str, Any]]) -> None:
         """Inverse of ``state_dict``."""
         for optimizer, state in zip(self.both, states, strict=True):
             optimizer.load_state_dict(state)
+            for group in optimizer.param_groups:
+                if "capturable" in group:
+                    group["capturable"] = self.recordable

@@ -307,26 +307,27 @@ def settling_step(config: TrainConfig) -> int:
 
 
 class Recorded:
-    """What a step does to a batch of one shape, as one CUDA graph."""
+    """What a step does with a batch of one shape, as one CUDA graph."""
 
-    def __init__(self, gradients: Callable[[Batch, Tensor], dict[str, Tensor]], batch: Batch, memory: Any) -> None:
+    def __init__(self, step: Callable[[Batch, Tensor, Tensor], dict[str, Tensor]], batch: Batch, memory: Any) -> None:
         device = batch.image.device
         self.batch = batch.changed(torch.clone)
-        self.weight = torch.zeros((), device=device)
+        self.weight, self.rate = torch.zeros((), device=device), torch.zeros((), device=device)
         beside, current = torch.cuda.Stream(device), torch.cuda.current_stream(device)  # type: ignore[no-untyped-call]
         beside.wait_stream(current)
-        with torch.cuda.stream(beside):  # libraries choose their kernels
+        with torch.cuda.stream(beside):  # libraries choose their kernels; at a rate of 0 nothing moves
             for _ in range(3):
-                gradients(self.batch, self.weight)
+                step(self.batch, self.weight, self.rate)
         current.wait_stream(beside)
         self.graph = torch.cuda.CUDAGraph()
         # another thread moves scenes to the device meanwhile
         with torch.cuda.graph(self.graph, pool=memory, capture_error_mode="thread_local"):
-            self.parts = gradients(self.batch, self.weight)
+            self.parts = step(self.batch, self.weight, self.rate)
 
-    def replay(self, batch: Batch, weight: float) -> dict[str, Tensor]:
-        """The gradients of another batch; its loss's parts."""
+    def replay(self, batch: Batch, weight: float, rate: float) -> dict[str, Tensor]:
+        """The step with another batch; its loss's parts."""
         self.weight.fill_(weight)
+        self.rate.fill_(rate)
         for own, other in zip(self.batch.tensors(), batch.tensors(), strict=True):
             own.copy_(other)
         self.graph.replay()
@@ -392,14 +393,13 @@ class Trainer:
         if self.step >= settling_step(self.config):
             for norm in self._norms():
                 norm.eval()
-        weight = emphasis(self.config, self.step)
-        parts = self._replayed(batch, weight) if self.device.type == "cuda" else self._gradients(batch, weight)
-        self.optimizers.step(learning_rate(self.config, self.step))
+        told = emphasis(self.config, self.step), learning_rate(self.config, self.step)
+        parts = self._replayed(batch, *told) if self.device.type == "cuda" else self._moved(batch, *told)
         self.step += 1
         return parts
 
-    def _gradients(self, batch: Batch, weight: float | Tensor) -> dict[str, Tensor]:
-        """Gradients of a batch's loss, clipped, in place of those before; the loss's parts."""
+    def _moved(self, batch: Batch, weight: float | Tensor, rate: float | Tensor) -> dict[str, Tensor]:
+        """Weights a step further, at the rate, by the clipped gradients of a batch's loss; the loss's parts."""
         for parameter in self.learning.parameters():
             if parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)
@@ -408,16 +408,17 @@ class Trainer:
             loss, parts = total_loss(self.pair, batch, self.config, self.teachers, weight)
         torch.autograd.backward(loss)
         nn.utils.clip_grad_norm_(self.learning.parameters(), self.config.clip_norm)
+        self.optimizers.step(rate)
         return parts
 
-    def _replayed(self, batch: Batch, weight: float) -> dict[str, Tensor]:
+    def _replayed(self, batch: Batch, weight: float, rate: float) -> dict[str, Tensor]:
         """The same on a CUDA device, recorded once for each kind of step: its thousands of kernels start as one."""
         norms_move = self.step < settling_step(self.config)
         cell = tuple(int(part * self.pair.stride) for part in batch.place)
         kind = (norms_move, cell, batch.mirrors if self.teachers else ())
         if kind not in self.recorded:
-            self.recorded[kind] = Recorded(self._gradients, batch, self.memory)
-        return self.recorded[kind].replay(batch, weight)
+            self.recorded[kind] = Recorded(self._moved, batch, self.memory)
+        return self.recorded[kind].replay(batch, weight, rate)
 
     def _norms(self) -> list[nn.BatchNorm2d]:
         return [m for m in self.learning.modules() if isinstance(m, nn.BatchNorm2d)]

@@ -1,0 +1,117 @@
+"""Pictures taken on the training device are those of the renderer and the developer, many at a time."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from model_export.config import SceneConfig, TrainConfig
+from model_export.darkroom import (
+    Spreads,
+    _areas,
+    _Surfaces,
+    _through_mosaic,
+    compressed,
+    photograph,
+    render,
+    retake,
+    sampled_taps,
+    transfers,
+)
+from model_export.render import Layer, PointSpread, _taps, render_layers, transfer
+from model_export.scenes import _through_mosaic as through_mosaic
+from model_export.scenes import draw_negative, draw_sample
+from model_export.train import collate_retaken
+
+CPU = torch.device("cpu")
+SCENES = SceneConfig(size_px=64, margin_px=24)
+CONFIG = TrainConfig(scenes=SCENES, retaken=True)
+NEGATIVES = [draw_negative(seed, SCENES) for seed in range(8)]
+
+
+def test_scenes_taken_together_look_as_each_does_alone() -> None:
+    surfaces = _Surfaces.of(NEGATIVES, CPU)
+    together, excess = render(surfaces, [negative.shot for negative in NEGATIVES])
+    for picture, found, negative in zip(together, excess[:, 0], NEGATIVES, strict=True):
+        maps = negative.surfaces.float()
+        layers = [Layer(m[:3], m[3:4], -m[4] * negative.shot.k_cam_px) for m in maps]
+        alone, front = render_layers(layers, negative.shot.spread)
+        assert torch.allclose(picture, alone, atol=2e-3)
+        assert (found == torch.take_along_dim(maps[:, 4], front[None], 0)[0]).float().mean() > 0.99
+
+
+@pytest.mark.parametrize("spread", [PointSpread(), PointSpread(1.0), PointSpread(0.6, 0.7, 1.0)])
+def test_transfer_functions_are_the_renderers(spread: PointSpread) -> None:
+    sigmas = np.array([0.0, 0.3, 0.7, 0.89, 0.9, 2.0, 9.0])
+    same = Spreads(*(np.full(len(sigmas), value) for value in (spread.disc_share, spread.squeeze, spread.angle)))
+    for found, sigma_px in zip(transfers(48, 60, sigmas, same, CPU), sigmas, strict=True):
+        assert torch.allclose(found, transfer(48, 60, float(sigma_px), spread), atol=1e-4)
+
+
+def test_sampled_gaussians_have_the_variance_asked_for() -> None:
+    for found, variance in zip(sampled_taps(np.array([0.05, 0.2, 0.79])), (0.05, 0.2, 0.79), strict=True):
+        taps = np.array([1.0, *(2 * weight for weight in _taps(variance))])
+        assert found == pytest.approx(taps / taps.sum(), abs=1e-4)
+
+
+def pixels(seed: int, size: int = 64) -> torch.Tensor:
+    return torch.from_numpy(draw_sample(seed, replace(SCENES, size_px=size)).image)[None].float()
+
+
+@pytest.mark.parametrize("quality", [60, 85, 98])
+def test_compression_is_that_of_a_jpeg(quality: int) -> None:
+    picture = pixels(3)
+    image = picture[0].permute(1, 2, 0).numpy().astype(np.uint8)
+    packed = cv2.imencode(".jpg", image[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    true = np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.float32)[:, :, ::-1]
+    found = compressed(picture, torch.tensor([float(quality)]))[0].permute(1, 2, 0).numpy()
+    lost = np.abs(true - image).mean()
+    assert np.abs(found - true).mean() < max(0.3 * lost, 0.6)
+
+
+def test_a_mosaic_of_colours_is_interpolated_as_opencv_does() -> None:
+    linear = pixels(1)[0] / 255
+    found = _through_mosaic(linear[None])[0].permute(1, 2, 0).numpy()
+    true = through_mosaic(linear.permute(1, 2, 0).numpy())
+    assert np.abs(found - true)[2:-2, 2:-2].max() < 1e-3
+
+
+def test_pictures_are_made_small_by_averaging_areas() -> None:
+    row = np.random.default_rng(0).random((1, 80), np.float32)
+    true = cv2.resize(row, (64, 1), interpolation=cv2.INTER_AREA)
+    assert row @ _areas(80, 64).T == pytest.approx(np.asarray(true), abs=1e-5)
+
+
+def test_a_scene_is_taken_by_another_camera_each_time_within_what_scenes_span() -> None:
+    rng = np.random.default_rng(0)
+    shots = [retake(rng, NEGATIVES[0], CONFIG) for _ in range(50)]
+    assert len({shot.k_cam_px for shot in shots}) > 40
+    for shot in shots:
+        assert SCENES.k_cam_px[0] <= shot.k_cam_px <= SCENES.k_cam_px[1]
+        assert SCENES.gamma_px[0] <= shot.gamma_px <= SCENES.gamma_px[1]
+        assert shot.focus_distance_m == NEGATIVES[0].shot.focus_distance_m
+
+
+def test_pictures_made_small_are_told_the_smaller_cameras_numbers() -> None:
+    for seed in range(40):  # a few of them are
+        images, excess, shots = photograph(np.random.default_rng(seed), NEGATIVES, CONFIG, CPU)
+        assert images.shape == (8, 3, 64, 64)
+        assert excess.shape == (8, 1, 64, 64)
+        assert 0 <= images.min() <= images.max() <= 1
+        ratios = {
+            round(shot.focal_length_px / n.shot.focal_length_px, 6) for shot, n in zip(shots, NEGATIVES, strict=True)
+        }
+        assert len(ratios) == 1
+        if ratios != {1.0}:
+            assert ratios == {0.8}
+            return
+    pytest.fail("none was made small")
+
+
+def test_the_same_seed_takes_the_same_pictures_another_takes_others() -> None:
+    one, same, other = (collate_retaken(NEGATIVES, np.random.default_rng(seed), CONFIG, CPU) for seed in (1, 1, 2))
+    assert torch.equal(one.image, same.image)
+    assert torch.equal(one.excess, same.excess)
+    assert not torch.equal(one.image, other.image)
