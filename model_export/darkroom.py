@@ -19,13 +19,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from model_export.config import TrainConfig
-from model_export.render import (
-    LEVEL_OFFSET_PX,
-    LEVEL_RATIO,
-    SAMPLED_BELOW_VARIANCE,
-    SAMPLED_TAPS,
-    SOFT_EDGE_VARIANCE,
-)
+from model_export.cores import columns, sent
+from model_export.render import GAUSSIAN, Numbers, Spreads, blur_varying, transfers
 from model_export.scenes import (
     GRAIN,
     GRAINY_SHARE,
@@ -44,7 +39,6 @@ from model_export.scenes import (
 from service.optics import thin_lens
 
 AGAIN = (0.5, 1.25)  # k_cam of another shot of a scene, of the first one's
-JOBS = 2**27  # numbers that are transformed at a time
 LEAST_MARGIN_PX = 16
 SQUARE, CROSS = ((1, 2, 1), (2, 4, 2), (1, 2, 1)), ((0, 1, 0), (1, 4, 1), (0, 1, 0))  # bilinear, of a colour mosaic
 BLOCK = 8
@@ -68,132 +62,12 @@ COLOUR_STEPS = (
 )
 TO_YCBCR = ((0.299, 0.587, 0.114), (-0.168736, -0.331264, 0.5), (0.5, -0.418688, -0.081312))
 FROM_YCBCR = ((1.0, 0.0, 1.402), (1.0, -0.344136, -0.714136), (1.0, 1.772, 0.0))
-Numbers = NDArray[np.float64]
-
-
-def sent(values: NDArray[Any] | Tensor, device: torch.device) -> Tensor:
-    """Numbers on the device, without waiting for what it has still to do."""
-    tensor = values if isinstance(values, Tensor) else torch.from_numpy(np.ascontiguousarray(values))
-    return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor
 
 
 @lru_cache
 def _constant(values: tuple[Any, ...], device: torch.device) -> Tensor:
     """The same, once for all."""
     return torch.tensor(values, dtype=torch.float32).to(device)
-
-
-def _columns(device: torch.device, *values: NDArray[Any]) -> tuple[Tensor, ...]:
-    """Numbers [n] each to go with maps, [n,1,1] each, sent together: to send costs more than what is sent."""
-    return sent(np.stack(values).astype(np.float32), device)[:, :, None, None].unbind()
-
-
-@lru_cache
-def _sampled_parameters() -> tuple[Numbers, Numbers]:
-    """Variances of sampled Gaussians, and their parameters."""
-    parameters = np.concatenate([[1e-4], np.linspace(0.02, 2 * SAMPLED_BELOW_VARIANCE, 4000)])
-    x2 = np.arange(1, SAMPLED_TAPS + 1) ** 2
-    weights = np.exp(-x2 / (2 * parameters[:, None]))
-    return 2 * (weights * x2).sum(1) / (1 + 2 * weights.sum(1)), parameters
-
-
-def sampled_taps(variance: Numbers) -> Numbers:
-    """What the sampled Gaussians of these variances [n] weigh at 0, 1, ... px [n,taps], both sides together."""
-    parameter = np.interp(variance, *_sampled_parameters())
-    weights = np.exp(-(np.arange(SAMPLED_TAPS + 1) ** 2) / (2 * parameter[:, None]))
-    weights[:, 1:] *= 2
-    return np.asarray(weights / weights.sum(1, keepdims=True))
-
-
-@lru_cache
-def _frequencies(height: int, width: int, device: torch.device) -> tuple[tuple[Tensor, Tensor], ...]:
-    """Down and across: cycles per pixel [f] of a spectrum, and their cosines at 0, 1, ... px [taps,f]."""
-    both = torch.fft.fftfreq(height), torch.fft.rfftfreq(width)
-    offsets = torch.arange(SAMPLED_TAPS + 1)[:, None]
-    return tuple((f.to(device), torch.cos(2 * math.pi * offsets * f).to(device)) for f in both)
-
-
-@dataclass(frozen=True, slots=True)
-class Spreads:
-    """Point spreads (``PointSpread``), a column [n] each: how much is disc, how squeezed, at which angle."""
-
-    disc_share: Numbers
-    squeeze: Numbers
-    angle: Numbers
-
-    def of(self, items: NDArray[np.intp]) -> "Spreads":
-        return Spreads(self.disc_share[items], self.squeeze[items], self.angle[items])
-
-
-def transfers(height: int, width: int, sigma_px: Numbers, spreads: Spreads, device: torch.device) -> Tensor:
-    """Transfer functions [n,h,w//2+1] of point spreads with these standard deviations [n]."""
-    variance = sigma_px**2
-    of_gauss = np.maximum((1 - spreads.disc_share) * variance, np.minimum(variance, SOFT_EDGE_VARIANCE))
-    longer_px = 2 * np.sqrt(np.maximum(variance - of_gauss, 0) * 2 / (1 + spreads.squeeze**2))
-    told = (of_gauss, of_gauss < SAMPLED_BELOW_VARIANCE, longer_px, np.cos(spreads.angle), np.sin(spreads.angle))
-    gauss, narrow, longer, cos, sin, squeeze = _columns(device, *told, spreads.squeeze)
-    taps = sent(sampled_taps(of_gauss).astype(np.float32), device)
-    (fy, cosines_down), (fx, cosines_across) = _frequencies(height, width, device)
-
-    def along_axis(f: Tensor, cosines: Tensor) -> Tensor:
-        smooth = torch.exp(-2 * math.pi**2 * gauss[:, :, 0] * f**2)
-        return torch.where(narrow[:, :, 0] > 0, taps @ cosines, smooth)
-
-    both = along_axis(fy, cosines_down)[:, :, None] * along_axis(fx, cosines_across)[:, None]
-    fy = fy[:, None]
-    along, across = fx * cos + fy * sin, squeeze * (fy * cos - fx * sin)
-    t = (2 * math.pi * longer * torch.sqrt(along**2 + across**2)).clamp_min(1e-4)
-    disc: Tensor = 2 * torch.special.bessel_j1(t) / t
-    return both * disc
-
-
-@dataclass(frozen=True, slots=True)
-class _Levels:
-    """The blurs of pictures whose blur varies, one after the other: whose, how strong, what is next below and above."""
-
-    item: NDArray[np.intp]
-    sigma_px: Numbers
-    below: Numbers
-    above: Numbers
-
-    @classmethod
-    def between(cls, low_px: Numbers, high_px: Numbers) -> "_Levels":
-        """``blur_levels`` of all, from the least to the strongest blur [n] of each."""
-        span = np.log((high_px + LEVEL_OFFSET_PX) / (low_px + LEVEL_OFFSET_PX))
-        count = np.maximum(1, np.ceil(span / math.log(LEVEL_RATIO))).astype(int) + 1
-        alike = high_px - low_px < 0.02
-        count[alike] = 1
-        item = np.repeat(np.arange(len(count)), count)
-        rank = np.arange(len(item)) - np.repeat(np.cumsum(count) - count, count)
-        part = rank / np.maximum(count - 1, 1)[item]
-        sigma_px = (low_px + LEVEL_OFFSET_PX)[item] * np.exp(span[item] * part) - LEVEL_OFFSET_PX
-        sigma_px = np.where(alike[item], ((low_px + high_px) / 2)[item], np.maximum(sigma_px, 0))
-        below, above = np.roll(sigma_px, 1), np.roll(sigma_px, -1)
-        return cls(item, sigma_px, np.where(rank > 0, below, np.nan), np.where(rank + 1 < count[item], above, np.nan))
-
-
-def blur_varying(images: Tensor, sigma_px: Tensor, bounds: tuple[Numbers, Numbers], spreads: Spreads) -> Tensor:
-    """Each of the images [n,c,h,w] blurred by its sigma [n,h,w], whose least and most are told, both [n]."""
-    device, (height, width) = images.device, images.shape[-2:]
-    levels = _Levels.between(*bounds)
-    spectra, variance = torch.fft.rfft2(images), sigma_px**2
-    out = torch.zeros_like(images)
-    step = max(1, JOBS // images[0].numel())
-    for start in range(0, len(levels.item), step):
-        part = slice(start, start + step)
-        item, level = levels.item[part], levels.sigma_px[part] ** 2
-        at = sent(item, device)
-        slopes, firsts = [], []
-        for other in (levels.below[part], levels.above[part]):
-            slopes.append(np.nan_to_num(1 / (level - other**2)))
-            firsts.append(np.where(np.isnan(other), 1, -slopes[-1] * np.nan_to_num(other) ** 2))
-        rise, fall, first, last = _columns(device, *slopes, *firsts)
-        seen = variance[at]
-        weight = torch.minimum(rise * seen + first, fall * seen + last).clamp(0, 1)
-        otf = transfers(height, width, levels.sigma_px[part], spreads.of(item), device)
-        blurred = torch.fft.irfft2(spectra[at] * otf[:, None], s=(height, width))
-        out.index_add_(0, at, weight[:, None] * blurred)
-    return out
 
 
 def retake(rng: np.random.Generator, negative: Negative, config: TrainConfig) -> Shot:
@@ -227,7 +101,7 @@ def _blurred(surfaces: _Surfaces, shots: Sequence[Shot]) -> tuple[Tensor, Tensor
     """Colour and alpha, both [n,3,h,w], of every surface as its scene's lens shows it."""
     maps, device = surfaces.maps, surfaces.maps.device
     spread = [shot.spread for shot in shots]
-    spreads = Spreads(*(np.array([getattr(s, name) for s in spread]) for name in ("disc_share", "squeeze", "angle")))
+    spreads = Spreads.of(spread)
     k_cam_px = np.array([shot.k_cam_px for shot in shots])
     shifts = np.array([(s.chromatic_px[0], 0.0, s.chromatic_px[1]) for s in spread])
     coloured = (shifts != 0).any(1)[surfaces.scene]
@@ -240,12 +114,12 @@ def _blurred(surfaces: _Surfaces, shots: Sequence[Shot]) -> tuple[Tensor, Tensor
             continue
         scene, at = surfaces.scene[items], sent(items, device)
         shift = shifts[scene, channels[0]]
-        gain, moved = _columns(device, -k_cam_px[scene], shift)
+        gain, moved = columns(device, -k_cam_px[scene], shift)
         signed = maps[at, 4] * gain + moved
         edges = -k_cam_px[scene] * surfaces.ends[:, items] + shift
         least = np.where(edges[0] * edges[1] <= 0, 0, np.abs(edges).min(0))
         seen = torch.stack([maps[at, channel] for channel in (*channels, 3)], 1)
-        blurred = blur_varying(seen, signed.abs(), (least, np.abs(edges).max(0)), spreads.of(scene))
+        blurred = blur_varying(seen, signed.abs(), spreads.at(scene), (least, np.abs(edges).max(0)))
         for i, channel in enumerate(channels):
             color[at, channel], alpha[at, channel] = blurred[:, i], blurred[:, -1]
     return color, alpha
@@ -343,7 +217,7 @@ def develop(
     read_noise = np.array([log_uniform(rng, READ_NOISE) for _ in range(n)])
     spread = rng.uniform(0, 0.9, n)
     filtered = ~through_mosaic & (spread > 0.3)  # filters make noise of neighbours alike
-    numbers = _columns(
+    numbers = columns(
         device,
         rng.uniform(0.5, 1.4, n),
         shot_noise,
@@ -412,8 +286,7 @@ def photograph(
             )
         )
     whole = linear.shape[-1]
-    nothing = np.zeros(len(shots))
-    otf = transfers(whole, whole, np.array(rests), Spreads(nothing, nothing + 1, nothing), device)
+    otf = transfers(whole, whole, np.array(rests), Spreads.of([GAUSSIAN] * len(shots)), device)
     linear = torch.fft.irfft2(torch.fft.rfft2(linear) * otf[:, None], s=(whole, whole))
     first = (whole - taken_px) // 2
     inner = slice(first, first + taken_px)

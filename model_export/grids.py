@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from model_export.render import DISC, GAUSSIAN, PointSpread, blur_varying
+from model_export.render import DISC, GAUSSIAN, PointSpread, Spreads, blur_varying
 from service.calibration.calibrate import Picture
 from service.calibration.report import Role
 from service.calibration.target import CircleGrid
@@ -126,7 +126,8 @@ def photograph(
     light = torch.from_numpy(_printed(pose, grid, places_mm, camera.gamma_px)[None])
     if not focused:
         signed = thin_lens.signed_defocus(depth_m, camera.focus_distance_m) * camera.k_cam_px
-        light = blur_varying(light, torch.from_numpy(np.abs(signed).astype(np.float32)), camera.spread, LEVEL_RATIO)
+        sigma_px = torch.from_numpy(np.abs(signed).astype(np.float32))
+        light = blur_varying(light[None], sigma_px[None], Spreads.of([camera.spread]), ratio=LEVEL_RATIO)[0]
     inner = light[0].numpy()[margin : margin + camera.height_px, margin : margin + camera.width_px]
     v, u = np.indices(inner.shape)
     away = (

@@ -26,8 +26,8 @@ from torch.nn.utils import convert_conv2d_weight_memory_format
 from torch.utils.data import DataLoader, Dataset
 
 from model_export.config import Kind, Learning, SceneConfig, TrainConfig
-from model_export.cores import computes_bfloat16, torch_threads
-from model_export.darkroom import photograph, sent
+from model_export.cores import computes_bfloat16, sent, torch_threads
+from model_export.darkroom import photograph
 from model_export.folded import folded
 from model_export.frames import load_frames
 from model_export.losses import UPRIGHT, UPSIDE_DOWN, Batch, run_pair, total_loss
@@ -376,7 +376,7 @@ class Trainer:
         for teacher in self.teachers:
             convert_conv2d_weight_memory_format(teacher.modules().to(self.device), torch.channels_last)
             if isinstance(teacher.depth, CompactDepth):
-                teacher.depth.lays_out = False  # nor is the layout seen in what learns
+                teacher.depth.lays_out = self.config.learning == "layout"  # seen in what learns then alone
 
     def moved(self, values: Tensor) -> Tensor:
         """To where steps are computed."""
@@ -388,6 +388,7 @@ class Trainer:
 
     def advance(self, batch: Batch) -> dict[str, Tensor]:
         """One optimiser step on a batch; the loss's parts."""
+        batch = batch.changed(self.moved)
         self.modules.eval()
         self.learning.train()
         if self.step >= settling_step(self.config):
@@ -436,7 +437,7 @@ class Trainer:
             norm.momentum = None
         with torch.no_grad(), self.autocast():
             for batch in batches:
-                run_pair(self.pair, batch)
+                run_pair(self.pair, batch.changed(self.moved))
         for norm, momentum in zip(norms, momenta, strict=True):
             norm.momentum = momentum
 
@@ -506,7 +507,10 @@ def train(
             pass
         if start is not None and weights is not None:
             if weights.is_dir():
-                spread_norms(start, (partial(run_pair, start, batch) for batch in pool.settling()))
+                start.modules().to(trainer.device)
+                spread_norms(
+                    start, (partial(run_pair, start, batch.changed(trainer.moved)) for batch in pool.settling())
+                )
             trainer.begin_with(with_fresh_decoders(start) if fresh_decoders else start)
         task = progress.add_task("training", total=config.steps, completed=trainer.step)
         for said in _steps(trainer, pool, test, path):

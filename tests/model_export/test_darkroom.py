@@ -9,7 +9,6 @@ import torch
 
 from model_export.config import SceneConfig, TrainConfig
 from model_export.darkroom import (
-    Spreads,
     _areas,
     _Surfaces,
     _through_mosaic,
@@ -17,10 +16,8 @@ from model_export.darkroom import (
     photograph,
     render,
     retake,
-    sampled_taps,
-    transfers,
 )
-from model_export.render import Layer, PointSpread, _taps, render_layers, transfer
+from model_export.render import Layer, render_layers
 from model_export.scenes import _through_mosaic as through_mosaic
 from model_export.scenes import draw_negative, draw_sample
 from model_export.train import collate_retaken
@@ -40,20 +37,6 @@ def test_scenes_taken_together_look_as_each_does_alone() -> None:
         alone, front = render_layers(layers, negative.shot.spread)
         assert torch.allclose(picture, alone, atol=2e-3)
         assert (found == torch.take_along_dim(maps[:, 4], front[None], 0)[0]).float().mean() > 0.99
-
-
-@pytest.mark.parametrize("spread", [PointSpread(), PointSpread(1.0), PointSpread(0.6, 0.7, 1.0)])
-def test_transfer_functions_are_the_renderers(spread: PointSpread) -> None:
-    sigmas = np.array([0.0, 0.3, 0.7, 0.89, 0.9, 2.0, 9.0])
-    same = Spreads(*(np.full(len(sigmas), value) for value in (spread.disc_share, spread.squeeze, spread.angle)))
-    for found, sigma_px in zip(transfers(48, 60, sigmas, same, CPU), sigmas, strict=True):
-        assert torch.allclose(found, transfer(48, 60, float(sigma_px), spread), atol=1e-4)
-
-
-def test_sampled_gaussians_have_the_variance_asked_for() -> None:
-    for found, variance in zip(sampled_taps(np.array([0.05, 0.2, 0.79])), (0.05, 0.2, 0.79), strict=True):
-        taps = np.array([1.0, *(2 * weight for weight in _taps(variance))])
-        assert found == pytest.approx(taps / taps.sum(), abs=1e-4)
 
 
 def pixels(seed: int, size: int = 64) -> torch.Tensor:

@@ -11,13 +11,15 @@ from model_export.render import (
     DISC,
     GAUSSIAN,
     Layer,
+    Levels,
     PointSpread,
+    Spreads,
     blur,
-    blur_levels,
     blur_varying,
     composite,
     refocus,
     render_layers,
+    sampled_taps,
 )
 from service.optics.camera import Camera
 from service.optics.light import decode_srgb, encode_srgb
@@ -119,6 +121,13 @@ def test_a_blurred_occluder_spills_over_a_sharp_ground() -> None:
     assert across[50] < 0.75
 
 
+def test_sampled_gaussians_have_the_variance_asked_for() -> None:
+    variances = np.array([0.01, 0.05, 0.2, 0.79])
+    taps = sampled_taps(variances)
+    assert taps.sum(1) == pytest.approx(1)
+    assert taps @ np.arange(taps.shape[1]) ** 2 == pytest.approx(variances, rel=1e-3, abs=1e-5)
+
+
 def test_in_focus_nothing_changes() -> None:
     rng = np.random.default_rng(1)
     image = rng.random((64, 64, 3)).astype(np.float32)
@@ -129,11 +138,10 @@ def test_in_focus_nothing_changes() -> None:
 def test_two_levels_of_blur_pass_for_the_one_between() -> None:
     point = torch.zeros(1, 128, 128)
     point[0, 64, 64] = 1
-    levels = blur_levels(2.0, 4.0)
-    middle = (levels[0] + levels[1]) / 2
-    sigma = torch.full((128, 128), middle)
-    sigma[0, 0], sigma[0, 1] = 2.0, 4.0
-    mixed, exact = blur_varying(point, sigma, GAUSSIAN)[0], blur(point, middle)[0]
+    ends = np.array([2.0]), np.array([4.0])
+    middle = float(Levels.between(*ends).sigma_px[:2].mean())
+    sigma = torch.full((1, 128, 128), middle)
+    mixed, exact = blur_varying(point[None], sigma, Spreads.of([GAUSSIAN]), ends)[0, 0], blur(point, middle)[0]
     offsets = torch.arange(-64, 64)
     assert float((mixed.sum(0) * offsets**2).sum()) == pytest.approx(middle**2, rel=5e-3)
     assert float((mixed - exact).abs().max()) < 0.08 * float(exact.max())
