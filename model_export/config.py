@@ -59,10 +59,10 @@ class TrainConfig:
 
     The last ``settled_share`` of the steps has the batch norms' statistics fixed, as the exported network has: all of
     them in a run that begins with weights, decoders' too. A ``taught`` run learns teachers' answers too, the side of
-    focus among them where ``side_weight`` is 0 or the layout is what is learned. ``learning`` is what moves: all or the depth network alone, either
-    without what tells the side by the layout, or that alone. Of the pictures ``turned_share`` do not stay upright, and
-    for ``hint_share`` a side is asked for. With ``retaken`` the pool holds scenes, not pictures: each batch takes
-    pictures of its own of them, where steps are computed (``darkroom.py``).
+    focus among them where ``side_weight`` is 0 or the layout is what is learned. ``learning`` is what moves: all or the
+    depth network alone, either without what tells the side by the layout, or that alone. Of the pictures
+    ``turned_share`` do not stay upright, and for ``hint_share`` a side is asked for. With ``retaken`` the pool holds
+    scenes, not pictures: each batch takes pictures of its own of them, where steps are computed (``darkroom.py``).
     """
 
     kind: Kind = "compact"

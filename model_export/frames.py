@@ -15,7 +15,7 @@ from model_export.datasets.photos import filled, load_photos
 from service.optics import thin_lens
 from service.optics.light import decode_srgb
 
-SIZES = (0.45, 1.0)  # of the frame's own size
+SIZES = (0.65, 1.0)  # of the frame's own size, but no less than what holds the window
 CONTRASTS = (0.75, 1.3)  # power of the light
 TINTS = (0.8, 1.2)
 # rendered rooms are looked at from 1.6 m, photographs of rooms from 2.3: what is out of focus is mostly behind
@@ -61,7 +61,8 @@ def draw_view(rng: np.random.Generator, frame: Frame, size: int) -> tuple[Map, M
 
     The last is the variance (px^2) of the blur it has beside its pixels' box, for having been made small.
     """
-    grow = math.exp(rng.uniform(*np.log(SIZES)))
+    least = min(max(SIZES[0], size / min(frame.image.shape[:2])), SIZES[1])
+    grow = math.exp(rng.uniform(math.log(least), math.log(SIZES[1])))
     height, width = (round(grow * side) for side in frame.image.shape[:2])
     image = cv2.resize(frame.image, (width, height), interpolation=cv2.INTER_AREA)
     # of the others, INTER_NEAREST takes the upper left pixel of an area and not its middle one

@@ -142,18 +142,19 @@ def told_by(teachers: Sequence[Pair], batch: Batch) -> tuple[BlurEstimate, Depth
 def likeness_loss(
     blur: BlurEstimate, depth: DepthEstimate, teachers: Sequence[Pair], batch: Batch, *, of_side: bool = False
 ) -> Tensor:
-    """How far the answers are from the teachers': float32 scalar.
+    """How far the answers are from the teachers', most where these are sure: float32 scalar.
 
-    All pixels weigh alike: were those to weigh more where teachers are sure, strong blur would be answered too low.
     But for the side, if not asked for: how often it is near is that of the scenes a teacher saw.
     """
     wise_blur, wise_depth = told_by(teachers, batch)
-    of_blur = (torch.log(blur.blur_px) - torch.log(wise_blur.blur_px)).abs()
-    of_near = (depth.log_ratio_near - wise_depth.log_ratio_near).abs()
-    of_far = (depth.log_ratio_far - wise_depth.log_ratio_far).abs()
+    sure_blur = torch.exp(-BETA * wise_blur.log_error)
+    sure_depth = torch.exp(-BETA * wise_depth.log_scale) / 2
+    of_blur = sure_blur * (torch.log(blur.blur_px) - torch.log(wise_blur.blur_px)).abs()
+    of_near = sure_depth * (depth.log_ratio_near - wise_depth.log_ratio_near).abs()
+    of_far = sure_depth * (depth.log_ratio_far - wise_depth.log_ratio_far).abs()
     of_errors = (blur.log_error - wise_blur.log_error).abs() + (depth.log_scale - wise_depth.log_scale).abs()
     side = (torch.sigmoid(depth.near_logit) - torch.sigmoid(wise_depth.near_logit)).abs() if of_side else 0.0
-    return (2 * of_blur + 1.5 * (of_near + of_far) + of_errors / 4 + side).mean()
+    return (of_blur + of_near + of_far + of_errors / 2 + side).mean()
 
 
 def total_loss(
