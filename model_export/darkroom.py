@@ -171,6 +171,7 @@ def _encoded(linear: Tensor) -> Tensor:
     return torch.where(clipped <= 0.0031308, clipped * 12.92, 1.055 * clipped.clamp_min(1e-4) ** (1 / 2.4) - 0.055)
 
 
+@lru_cache
 def _cosines(device: torch.device) -> Tensor:
     """The orthonormal cosine transform of a block's side [8,8]."""
     k, x = torch.arange(BLOCK, device=device)[:, None], torch.arange(BLOCK, device=device)[None]
@@ -212,7 +213,6 @@ def develop(
 ) -> Tensor:
     """Light on the sensor [n,3,h,w] to a JPEG's pixels in 0..255, as ``scenes.develop`` does."""
     n, device = len(linear), linear.device
-
     shot_noise = np.array([log_uniform(rng, GRAIN if rng.random() < GRAINY_SHARE else SHOT_NOISE) for _ in range(n)])
     read_noise = np.array([log_uniform(rng, READ_NOISE) for _ in range(n)])
     spread = rng.uniform(0, 0.9, n)

@@ -90,10 +90,11 @@ class Optimizers:
             optimizer.step()
 
     def state_dict(self) -> list[dict[str, Any]]:
-        for optimizer in self.both:
-            for group in optimizer.param_groups:
+        states = [optimizer.state_dict() for optimizer in self.both]
+        for state in states:
+            for group in state["param_groups"]:
                 group["lr"] = float(group["lr"])
-        return [optimizer.state_dict() for optimizer in self.both]
+        return states
 
     def load_state_dict(self, states: list[dict[str, Any]]) -> None:
         """Inverse of ``state_dict``."""

@@ -48,6 +48,7 @@ AHEAD = 64
 MOST_HELD_OUT = 32
 
 Drawn = Sample | Negative
+new_stream: Callable[[torch.device], torch.cuda.Stream] = torch.cuda.Stream  # whose own signature has no types
 
 
 class SceneStream(Dataset[Drawn]):
@@ -91,7 +92,7 @@ def arriving(stream: Iterator[Drawn], device: torch.device) -> Iterator[Drawn]:
     waiting: Queue[Drawn | Exception | None] = Queue(AHEAD)
 
     def bring() -> None:
-        beside = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+        beside = new_stream(device)
         try:
             with torch.cuda.stream(beside):
                 for drawn in stream:
@@ -313,7 +314,7 @@ class Recorded:
         device = batch.image.device
         self.batch = batch.changed(torch.clone)
         self.weight, self.rate = torch.zeros((), device=device), torch.zeros((), device=device)
-        beside, current = torch.cuda.Stream(device), torch.cuda.current_stream(device)  # type: ignore[no-untyped-call]
+        beside, current = new_stream(device), torch.cuda.current_stream(device)
         beside.wait_stream(current)
         with torch.cuda.stream(beside):  # libraries choose their kernels; at a rate of 0 nothing moves
             for _ in range(3):
@@ -395,16 +396,13 @@ class Trainer:
             for norm in self._norms():
                 norm.eval()
         told = emphasis(self.config, self.step), learning_rate(self.config, self.step)
-        parts = self._replayed(batch, *told) if self.device.type == "cuda" else self._moved(batch, *told)
+        parts = self._replayed(batch, *told) if self.device.type == "cuda" else self._stepped(batch, *told)
         self.step += 1
         return parts
 
-    def _moved(self, batch: Batch, weight: float | Tensor, rate: float | Tensor) -> dict[str, Tensor]:
+    def _stepped(self, batch: Batch, weight: float | Tensor, rate: float | Tensor) -> dict[str, Tensor]:
         """Weights a step further, at the rate, by the clipped gradients of a batch's loss; the loss's parts."""
-        for parameter in self.learning.parameters():
-            if parameter.grad is None:
-                parameter.grad = torch.zeros_like(parameter)
-        torch._foreach_zero_([p.grad for p in self.learning.parameters() if p.grad is not None])
+        self.learning.zero_grad(set_to_none=False)  # a recorded step writes them where they are
         with self.autocast():
             loss, parts = total_loss(self.pair, batch, self.config, self.teachers, weight)
         torch.autograd.backward(loss)
@@ -418,7 +416,7 @@ class Trainer:
         cell = tuple(int(part * self.pair.stride) for part in batch.place)
         kind = (norms_move, cell, batch.mirrors if self.teachers else ())
         if kind not in self.recorded:
-            self.recorded[kind] = Recorded(self._moved, batch, self.memory)
+            self.recorded[kind] = Recorded(self._stepped, batch, self.memory)
         return self.recorded[kind].replay(batch, weight, rate)
 
     def _norms(self) -> list[nn.BatchNorm2d]:
