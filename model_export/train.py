@@ -414,7 +414,7 @@ class Trainer:
         """The same on a CUDA device, recorded once for each kind of step: its thousands of kernels start as one."""
         norms_move = self.step < settling_step(self.config)
         cell = tuple(int(part * self.pair.stride) for part in batch.place)
-        kind = (norms_move, cell, batch.mirrors if self.teachers else ())
+        kind = (batch.image.shape, norms_move, cell, batch.mirrors if self.teachers else ())
         if kind not in self.recorded:
             self.recorded[kind] = Recorded(self._stepped, batch, self.memory)
         return self.recorded[kind].replay(batch, weight, rate)
