@@ -59,10 +59,11 @@ class TrainConfig:
 
     The last ``settled_share`` of the steps has the batch norms' statistics fixed, as the exported network has: all of
     them in a run that begins with weights, decoders' too. A ``taught`` run learns teachers' answers too, the side of
-    focus among them where ``side_weight`` is 0 or the layout is what is learned. ``learning`` is what moves: all or the
-    depth network alone, either without what tells the side by the layout, or that alone. Of the pictures
-    ``turned_share`` do not stay upright, and for ``hint_share`` a side is asked for. With ``retaken`` the pool holds
-    scenes, not pictures: each batch takes pictures of its own of them, where steps are computed (``darkroom.py``).
+    focus among them where ``side_weight`` is 0 or the layout is what is learned, of two of four mirror images or of
+    ``all_mirrors``. ``learning`` is what moves: all or the depth network alone, either without what tells the side by
+    the layout, or that alone. Of the pictures ``turned_share`` do not stay upright, ``faded_share`` lose contrast, and
+    for ``hint_share`` a side is asked for. With ``retaken`` the pool holds scenes, not pictures: each batch takes
+    pictures of its own of them, where steps are computed (``darkroom.py``).
     """
 
     kind: Kind = "compact"
@@ -77,6 +78,7 @@ class TrainConfig:
     b_weight: float = 1.0
     side_weight: float = 0.3
     taught: bool = False
+    all_mirrors: bool = False
     learning: Learning = "all"
     likeness_weight: float = 10.0
     pool: int = 600
@@ -84,6 +86,7 @@ class TrainConfig:
     retaken: bool = False
     turned_share: float = 0.3
     hint_share: float = 0.5
+    faded_share: float = 0.0
     checkpoint_every: int = 250
     settled_share: float = 0.35
     settle_batches: int = 60

@@ -30,7 +30,7 @@ from model_export.cores import computes_bfloat16, sent, torch_threads
 from model_export.darkroom import photograph
 from model_export.folded import folded
 from model_export.frames import load_frames
-from model_export.losses import UPRIGHT, UPSIDE_DOWN, Batch, run_pair, total_loss
+from model_export.losses import UPRIGHT, UPSIDE_DOWN, Batch, Mirror, run_pair, total_loss
 from model_export.networks import SHIPPED_WIDTHS, CompactDepth, Pair, Widths, make_pair, with_fresh_decoders
 from model_export.optimizers import Optimizers
 from model_export.progress import progress_bar
@@ -40,6 +40,7 @@ from model_export.textures import load_photographs
 from service.cores import available_cores
 
 FOCAL_UNKNOWN_SHARE = 0.3
+LEAST_CONTRAST = 0.2  # of a faded picture, as a part of what it had
 # a camera known by its specs has a guess for gamma: mostly too low a one, since motion, haze and filters add softness
 GUESSED_GAMMA_SHARE, GUESSED_GAMMA = 0.6, (-0.2, 0.35)  # mean and standard deviation of the guess's log error
 HELD_OUT_SEED = 2**40
@@ -164,7 +165,7 @@ def collate(samples: list[Sample], rng: np.random.Generator, config: TrainConfig
         excesses.append(np.rot90(sample.excess, turns)[:, ::flip].astype(np.float32))
         rows.append(_told(rng, sample.shot, config))
     image = torch.from_numpy(np.stack(images)).float() / 255
-    return _batch(rng, image, torch.from_numpy(np.stack(excesses))[:, None], rows)
+    return _batch(rng, config, image, torch.from_numpy(np.stack(excesses))[:, None], rows)
 
 
 def collate_retaken(
@@ -180,7 +181,7 @@ def collate_retaken(
         both[chosen] = torch.rot90(both[chosen], turn, (2, 3))
     flipped = sent(np.array(flips) < 0, device)[:, None, None, None]
     both = torch.where(flipped, both.flip(3), both)
-    return _batch(rng, both[:, :3], both[:, 3:], [_told(rng, shot, config) for shot in shots])
+    return _batch(rng, config, both[:, :3], both[:, 3:], [_told(rng, shot, config) for shot in shots])
 
 
 def _turn(rng: np.random.Generator, config: TrainConfig) -> tuple[int, int]:
@@ -196,11 +197,25 @@ def _told(rng: np.random.Generator, shot: Shot, config: TrainConfig) -> tuple[fl
     return (shot.k_cam_px, shot.gamma_px, guess * shot.gamma_px, shot.focus_distance_m, focal, side)
 
 
-def _batch(rng: np.random.Generator, image: Tensor, excess: Tensor, rows: Sequence[tuple[float, ...]]) -> Batch:
+def _faded(rng: np.random.Generator, image: Tensor, share: float) -> Tensor:
+    """Pictures [n,3,h,w] in 0..1, that share of them with less contrast, in steps of a grey level again."""
+    fades = rng.random(len(image)) < share
+    left = np.where(fades, LEAST_CONTRAST ** rng.random(len(image)), 1).astype(np.float32)
+    mean = image.mean((2, 3), keepdim=True)
+    faded = mean + sent(left, image.device)[:, None, None, None] * (image - mean)
+    return (faded * 255).round() / 255
+
+
+def _batch(
+    rng: np.random.Generator, config: TrainConfig, image: Tensor, excess: Tensor, rows: Sequence[tuple[float, ...]]
+) -> Batch:
     columns = sent(torch.tensor(rows, dtype=torch.float32), image.device).unbind(1)
     place = (rng.random(), rng.random())
-    # all four would cost teachers more than the step itself
-    mirrors = (UPRIGHT[rng.integers(2)], UPSIDE_DOWN[rng.integers(2)])
+    mirrors: tuple[Mirror, ...] = UPRIGHT + UPSIDE_DOWN
+    if not config.all_mirrors:  # on two cores all four cost teachers more than the step itself
+        mirrors = (UPRIGHT[rng.integers(2)], UPSIDE_DOWN[rng.integers(2)])
+    if config.faded_share:
+        image = _faded(rng, image, config.faded_share)
     return Batch(image.contiguous(memory_format=torch.channels_last), excess, *columns, place=place, mirrors=mirrors)
 
 

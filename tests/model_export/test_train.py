@@ -324,6 +324,23 @@ def test_every_batch_is_shown_to_teachers_upright_and_upside_down() -> None:
     sample = draw_sample(0, SCENES)
     drawn = {collate([sample], np.random.default_rng(seed)).mirrors for seed in range(40)}
     assert drawn == {(one, other) for one in UPRIGHT for other in UPSIDE_DOWN}
+    everything = collate([sample], np.random.default_rng(0), TrainConfig(all_mirrors=True))
+    assert everything.mirrors == UPRIGHT + UPSIDE_DOWN
+
+
+def test_faded_pictures_are_told_as_they_were_and_have_grey_levels_still() -> None:
+    samples = [draw_sample(seed, SCENES) for seed in range(12)]
+    own, faded = (
+        collate(samples, np.random.default_rng(0), TrainConfig(faded_share=share, turned_share=0, hint_share=0))
+        for share in (0.0, 0.5)
+    )
+    left = faded.image.std((1, 2, 3)) / own.image.std((1, 2, 3))
+    assert bool(((left > 0.15) & (left < 1.01)).all())
+    assert 2 <= int((left < 0.95).sum()) <= 10
+    assert torch.equal(faded.excess, own.excess)
+    torch.testing.assert_close(faded.image.mean((2, 3)), own.image.mean((2, 3)), atol=1e-3, rtol=0)
+    levels = faded.image * 255
+    torch.testing.assert_close(levels, levels.round(), atol=1e-3, rtol=0)
 
 
 def test_the_side_is_learned_from_the_truth_alone_where_it_is_learned_from_that() -> None:
