@@ -1,11 +1,12 @@
 """Two numbers for the manifest, found on scenes that were not trained on: blur right on the whole, errors honest."""
 
+import itertools
 import math
 from pathlib import Path
 
 import numpy as np
 
-from model_export.cases import procedural_cases
+from model_export.cases import PROCEDURAL_SIDES, procedural_cases
 from model_export.evaluate import Examiner, Pixels
 from service.inference.artifact import Manifest, load_model_folder, write_manifest
 
@@ -32,15 +33,17 @@ def temperature(pixels: Pixels) -> float:
 def calibrate(model: Path) -> tuple[float, float]:
     """Find both for a model folder and write them into its manifest: ``blur_gain`` and ``temperature``.
 
-    The side is told: being on the wrong side of focus is what the other hypothesis is for. Raises ``ValueError`` for a
-    model that no gain or no temperature in bounds makes right.
+    Blur is that of scenes on either side of focus and on both. Errors are those where the side is told: being on the
+    wrong side of focus is what the other hypothesis is for. Raises ``ValueError`` for a model that no gain or no
+    temperature in bounds makes right.
     """
-    cases = [case for side in (-1, 1) for case in procedural_cases(SCENES, side, FIRST)]
+    cases = {side: list(procedural_cases(SCENES, side, FIRST)) for side in PROCEDURAL_SIDES.values()}
     examiner = Examiner(model)
-    seen = [examiner.answer(case)[0].blur for case in cases]
+    seen = [examiner.answer(case)[0].blur for case in itertools.chain(*cases.values())]
     gain = _told(model, "blur_gain", blur_gain(Pixels.joined([blur for blur in seen if blur is not None])))
     examiner = Examiner(model)
-    found = temperature(Pixels.joined([examiner.told(case, case.camera)[0].depth for case in cases]))
+    told = [examiner.told(case, case.camera)[0].depth for side in (-1, 1) for case in cases[side]]
+    found = temperature(Pixels.joined(told))
     return gain, _told(model, "temperature", found)
 
 
