@@ -61,9 +61,10 @@ class TrainConfig:
     them in a run that begins with weights, decoders' too. A ``taught`` run learns teachers' answers too, the side of
     focus among them where ``side_weight`` is 0 or the layout is what is learned, of two of four mirror images or of
     ``all_mirrors``. ``learning`` is what moves: all or the depth network alone, either without what tells the side by
-    the layout, or that alone. Of the pictures ``turned_share`` do not stay upright, ``faded_share`` lose contrast, and
-    for ``hint_share`` a side is asked for. With ``retaken`` the pool holds scenes, not pictures: each batch takes
-    pictures of its own of them, where steps are computed (``darkroom.py``).
+    the layout, or that alone. Of the pictures ``turned_share`` do not stay upright, for
+    ``hint_share`` a side is asked for; ``faded_share`` lose contrast and ``dimmed_share`` light before what learns, but
+    no teacher, sees them. With ``retaken`` the pool holds scenes, not pictures: each batch takes pictures of its own of
+    them, where steps are computed (``darkroom.py``).
     """
 
     kind: Kind = "compact"
@@ -87,6 +88,7 @@ class TrainConfig:
     turned_share: float = 0.3
     hint_share: float = 0.5
     faded_share: float = 0.0
+    dimmed_share: float = 0.0
     checkpoint_every: int = 250
     settled_share: float = 0.35
     settle_batches: int = 60

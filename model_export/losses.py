@@ -37,7 +37,7 @@ class Batch:
     asked for, 0 for both: the other may be in the picture. ``place`` in 0..1 is which pixel of a network's cell its
     truth is, down and across: any at times, for always the first would move all answers by half a pixel.
     ``mirrors`` are the axes along which teachers see it mirrored, one of ``UPRIGHT`` among them: what they answer on
-    average errs less.
+    average errs less. ``contrast`` and ``light`` are the parts of its own in 0..1 that what learns is shown.
     """
 
     image: Tensor
@@ -48,6 +48,8 @@ class Batch:
     focus_distance_m: Tensor
     focal_length_px: Tensor
     side: Tensor
+    contrast: Tensor
+    light: Tensor
     place: tuple[float, float] = field(default=(0.0, 0.0), kw_only=True)
     mirrors: tuple[Mirror, ...] = field(default=((),), kw_only=True)
 
@@ -62,6 +64,13 @@ class Batch:
 
     def scene(self) -> Scene:
         return Scene(self.focus_distance_m, self.focal_length_px, self.side)
+
+    def worn(self) -> "Batch":
+        """With less contrast and light, in steps of a grey level again: what learns sees the picture so."""
+        contrast, light = self.contrast[:, None, None, None], self.light[:, None, None, None]
+        mean = self.image.mean((2, 3), keepdim=True)
+        levels = (light * (mean + contrast * (self.image - mean)) * 255).round()
+        return replace(self, image=torch.where(contrast * light < 1, levels / 255, self.image))
 
 
 def laplace(error: Tensor, log_scale: Tensor) -> Tensor:
@@ -144,7 +153,8 @@ def likeness_loss(
 ) -> Tensor:
     """How far the answers are from the teachers', most where these are sure: float32 scalar.
 
-    But for the side, if not asked for: how often it is near is that of the scenes a teacher saw.
+    But for the side, if not asked for: how often it is near is that of the scenes a teacher saw. Teachers see the
+    picture with all its contrast and light; how sure they are of it says nothing of a worn one.
     """
     wise_blur, wise_depth = told_by(teachers, batch)
     sure_blur = torch.exp(-BETA * wise_blur.log_error)
@@ -153,6 +163,7 @@ def likeness_loss(
     of_near = sure_depth * (depth.log_ratio_near - wise_depth.log_ratio_near).abs()
     of_far = sure_depth * (depth.log_ratio_far - wise_depth.log_ratio_far).abs()
     of_errors = (blur.log_error - wise_blur.log_error).abs() + (depth.log_scale - wise_depth.log_scale).abs()
+    of_errors = of_errors * (batch.contrast * batch.light == 1)[:, None, None, None]
     side = (torch.sigmoid(depth.near_logit) - torch.sigmoid(wise_depth.near_logit)).abs() if of_side else 0.0
     return (of_blur + of_near + of_far + of_errors / 2 + side).mean()
 
@@ -164,7 +175,7 @@ def total_loss(
 
     ``emphasis`` is that of what stands out.
     """
-    blur, depth = run_pair(pair, batch)
+    blur, depth = run_pair(pair, batch.worn())
     excess = reduced(batch.excess, pair.stride, batch.place).float()
     defocus_px = excess.abs() * batch.k_cam_px[:, None, None, None]
     true_blur = thin_lens.blur_from_defocus(defocus_px, batch.gamma_px[:, None, None, None])

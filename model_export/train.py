@@ -40,7 +40,8 @@ from model_export.textures import load_photographs
 from service.cores import available_cores
 
 FOCAL_UNKNOWN_SHARE = 0.3
-LEAST_CONTRAST = 0.2  # of a faded picture, as a part of what it had
+LEAST_CONTRAST = 0.15  # of a faded picture, as a part of what it had
+LEAST_LIGHT = 0.2  # of a dimmed one
 # a camera known by its specs has a guess for gamma: mostly too low a one, since motion, haze and filters add softness
 GUESSED_GAMMA_SHARE, GUESSED_GAMMA = 0.6, (-0.2, 0.35)  # mean and standard deviation of the guess's log error
 HELD_OUT_SEED = 2**40
@@ -190,20 +191,17 @@ def _turn(rng: np.random.Generator, config: TrainConfig) -> tuple[int, int]:
 
 
 def _told(rng: np.random.Generator, shot: Shot, config: TrainConfig) -> tuple[float, ...]:
-    """A shot as a batch has it: k_cam, gamma, the gamma that is told, focus distance, focal length and side."""
+    """A shot as a batch has it: numbers of its camera, the gamma told, the side, what is left of contrast and light."""
     focal = 0.0 if rng.random() < FOCAL_UNKNOWN_SHARE else shot.focal_length_px
     side = (shot.side or int(rng.choice([-1, 1]))) if rng.random() < config.hint_share else 0
     guess = math.exp(rng.normal(*GUESSED_GAMMA)) if rng.random() < GUESSED_GAMMA_SHARE else 1.0
-    return (shot.k_cam_px, shot.gamma_px, guess * shot.gamma_px, shot.focus_distance_m, focal, side)
+    worn = _left(rng, config.faded_share, LEAST_CONTRAST), _left(rng, config.dimmed_share, LEAST_LIGHT)
+    return (shot.k_cam_px, shot.gamma_px, guess * shot.gamma_px, shot.focus_distance_m, focal, side, *worn)
 
 
-def _faded(rng: np.random.Generator, image: Tensor, share: float) -> Tensor:
-    """Pictures [n,3,h,w] in 0..1, that share of them with less contrast, in steps of a grey level again."""
-    fades = rng.random(len(image)) < share
-    left = np.where(fades, LEAST_CONTRAST ** rng.random(len(image)), 1).astype(np.float32)
-    mean = image.mean((2, 3), keepdim=True)
-    faded = mean + sent(left, image.device)[:, None, None, None] * (image - mean)
-    return (faded * 255).round() / 255
+def _left(rng: np.random.Generator, share: float, least: float) -> float:
+    """What is left of 1, in that share of the pictures: at least so much, all orders of magnitude alike."""
+    return float(least ** rng.random()) if rng.random() < share else 1.0
 
 
 def _batch(
@@ -214,8 +212,6 @@ def _batch(
     mirrors: tuple[Mirror, ...] = UPRIGHT + UPSIDE_DOWN
     if not config.all_mirrors:  # on two cores all four cost teachers more than the step itself
         mirrors = (UPRIGHT[rng.integers(2)], UPSIDE_DOWN[rng.integers(2)])
-    if config.faded_share:
-        image = _faded(rng, image, config.faded_share)
     return Batch(image.contiguous(memory_format=torch.channels_last), excess, *columns, place=place, mirrors=mirrors)
 
 

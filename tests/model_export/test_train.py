@@ -1,5 +1,6 @@
 """Training: one seed is one run, stopped or not, and a run learns."""
 
+import copy
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -16,7 +17,7 @@ from rich.console import Console
 from model_export.config import Learning, SceneConfig, TrainConfig
 from model_export.cores import torch_threads
 from model_export.folded import folded
-from model_export.losses import UPRIGHT, UPSIDE_DOWN, likeness_loss, reduced, run_pair, told_by, total_loss
+from model_export.losses import UPRIGHT, UPSIDE_DOWN, Batch, likeness_loss, reduced, run_pair, told_by, total_loss
 from model_export.networks import Widths, make_pair, with_fresh_decoders
 from model_export.restored import restored, spread_norms
 from model_export.scenes import Material, draw_sample
@@ -328,19 +329,40 @@ def test_every_batch_is_shown_to_teachers_upright_and_upside_down() -> None:
     assert everything.mirrors == UPRIGHT + UPSIDE_DOWN
 
 
-def test_faded_pictures_are_told_as_they_were_and_have_grey_levels_still() -> None:
+def test_worn_pictures_have_less_contrast_or_light_in_grey_levels_still() -> None:
     samples = [draw_sample(seed, SCENES) for seed in range(12)]
-    own, faded = (
-        collate(samples, np.random.default_rng(0), TrainConfig(faded_share=share, turned_share=0, hint_share=0))
-        for share in (0.0, 0.5)
-    )
-    left = faded.image.std((1, 2, 3)) / own.image.std((1, 2, 3))
-    assert bool(((left > 0.15) & (left < 1.01)).all())
-    assert 2 <= int((left < 0.95).sum()) <= 10
-    assert torch.equal(faded.excess, own.excess)
-    torch.testing.assert_close(faded.image.mean((2, 3)), own.image.mean((2, 3)), atol=1e-3, rtol=0)
-    levels = faded.image * 255
-    torch.testing.assert_close(levels, levels.round(), atol=1e-3, rtol=0)
+    for config in (TrainConfig(faded_share=0.5), TrainConfig(dimmed_share=0.5)):
+        batch = collate(samples, np.random.default_rng(0), config)
+        worn, left = batch.worn().image, (batch.contrast * batch.light)[:, None]
+        assert 2 <= int((left < 1).sum()) <= 10
+        torch.testing.assert_close(worn.std((2, 3)), left * batch.image.std((2, 3)), atol=2e-3, rtol=0.02)
+        light = batch.light[:, None] * batch.image.mean((2, 3))
+        torch.testing.assert_close(worn.mean((2, 3)), light, atol=2e-3, rtol=0)
+        levels = worn[left[:, 0] < 1] * 255
+        torch.testing.assert_close(levels, levels.round(), atol=1e-3, rtol=0)
+        assert torch.equal(worn[left[:, 0] == 1], batch.image[left[:, 0] == 1])
+
+
+def test_teachers_see_whole_what_is_learned_of_worn_pictures() -> None:
+    """How sure they are of the whole says nothing of how sure to be of less."""
+    drawn = collate([draw_sample(seed, SCENES) for seed in range(2)], np.random.default_rng(0))
+    whole = replace(drawn, mirrors=((),))
+    worn = replace(whole, contrast=torch.full((2,), 0.3))
+    wise = make_pair("compact")
+    pair = copy.deepcopy(wise)
+
+    def unlike(batch: Batch) -> float:
+        return float(total_loss(pair, batch, CONFIG, [wise])[1]["likeness"])
+
+    for one in (wise, pair):
+        one.modules().eval()
+    with torch.no_grad():
+        assert unlike(whole) == 0
+        of_worn = unlike(worn)
+        assert of_worn > 0
+        pair.modules().get_parameter("depth.head.bias")[4] += 0.5  # how sure it is, no more
+        assert unlike(whole) > 0
+        assert unlike(worn) == of_worn
 
 
 def test_the_side_is_learned_from_the_truth_alone_where_it_is_learned_from_that() -> None:
