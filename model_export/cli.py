@@ -173,19 +173,21 @@ def export(
 ) -> None:
     """Write a checkpoint as a model folder, and in it one in int8: two ONNX graphs, card and manifest each."""
     with _training_parts():
-        from model_export.corrections import calibrate
+        from model_export.corrections import calibrate, unseen_cases
         from model_export.export import export_checkpoint
         from model_export.quantized import quantised_graphs
 
     pictures = [folder for folder in (textures, frames) if folder is not None]
     with progress_bar(Console(stderr=True)) as progress:
-        task = progress.add_task("float32", total=4)
+        task = progress.add_task("float32", total=5)
         manifest = export_checkpoint(checkpoint, pictures, out, name)
         progress.update(task, advance=1, description=INT8)
         export_checkpoint(checkpoint, pictures, out / INT8, f"{manifest.name}-{INT8}", quantised_graphs)
         progress.update(task, advance=1, description="held-out scenes")
+        cases = unseen_cases()
+        progress.advance(task)
         for folder in (out, out / INT8):
-            gain, temperature = calibrate(folder)
+            gain, temperature = calibrate(folder, cases)
             progress.advance(task)
             typer.echo(f"{folder}: blur times {gain:.3f}, stated errors times {temperature:.2f}")
 

@@ -2,10 +2,13 @@
 
 import json
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from pydantic import TypeAdapter, ValidationError
+
+LARGER = 4  # times as many pixels
+LARGE_SEED = 2**16  # larger pictures' seed is so much above
 
 Kind = Literal["compact", "paper"]
 Learning = Literal["all", "depth", "layout"]
@@ -61,10 +64,10 @@ class TrainConfig:
     them in a run that begins with weights, decoders' too. A ``taught`` run learns teachers' answers too, the side of
     focus among them where ``side_weight`` is 0 or the layout is what is learned, of two of four mirror images or of
     ``all_mirrors``. ``learning`` is what moves: all or the depth network alone, either without what tells the side by
-    the layout, or that alone. Of the pictures ``turned_share`` do not stay upright, for
-    ``hint_share`` a side is asked for; ``faded_share`` lose contrast and ``dimmed_share`` light before what learns, but
-    no teacher, sees them. With ``retaken`` the pool holds scenes, not pictures: each batch takes pictures of its own of
-    them, where steps are computed (``darkroom.py``).
+    the layout, or that alone. Of the pictures ``turned_share`` do not stay upright, for ``hint_share`` a side is asked
+    for; ``faded_share`` lose contrast and ``dimmed_share`` light before what learns, but no teacher, sees them. Of the
+    steps ``large_share`` have a quarter as many, twice as large. With ``retaken`` the pool holds scenes, not pictures:
+    each batch takes pictures of its own of them, where steps are computed (``darkroom.py``).
     """
 
     kind: Kind = "compact"
@@ -87,12 +90,24 @@ class TrainConfig:
     retaken: bool = False
     turned_share: float = 0.3
     hint_share: float = 0.5
+    large_share: float = 0.0
     faded_share: float = 0.0
     dimmed_share: float = 0.0
     checkpoint_every: int = 250
     settled_share: float = 0.35
     settle_batches: int = 60
     scenes: SceneConfig = MIXTURE
+
+    def enlarged(self) -> "TrainConfig":
+        """What the steps with larger pictures draw from: scenes of their own, a quarter as many."""
+        return replace(
+            self,
+            seed=self.seed + LARGE_SEED,
+            batch=max(1, self.batch // LARGER),
+            pool=max(1, self.pool // LARGER),
+            fresh_per_step=self.fresh_per_step / LARGER,
+            scenes=replace(self.scenes, size_px=2 * self.scenes.size_px),
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """The config as JSON has it."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from model_export.cases import PROCEDURAL_SIDES, procedural_cases
+from model_export.cases import PROCEDURAL_SIDES, Case, procedural_cases
 from model_export.evaluate import Examiner, Pixels
 from service.inference.artifact import Manifest, load_model_folder, write_manifest
 
@@ -15,6 +15,8 @@ FIRST = 2**20  # far from the scenes that evaluation draws
 WELL_READ_PX = (1.0, 8.0)
 HELD = ((1, 0.68), (2, 0.95))  # what intervals of so many deviations should hold
 DECIMALS = 3
+
+Cases = dict[int, list[Case]]
 
 
 def blur_gain(pixels: Pixels) -> float:
@@ -30,14 +32,18 @@ def temperature(pixels: Pixels) -> float:
     return float(math.prod(needed) ** (1 / len(needed)))
 
 
-def calibrate(model: Path) -> tuple[float, float]:
+def unseen_cases() -> Cases:
+    """Scenes by the side of focus that they are on, drawn once for every model folder."""
+    return {side: list(procedural_cases(SCENES, side, FIRST)) for side in PROCEDURAL_SIDES.values()}
+
+
+def calibrate(model: Path, cases: Cases) -> tuple[float, float]:
     """Find both for a model folder and write them into its manifest: ``blur_gain`` and ``temperature``.
 
     Blur is that of scenes on either side of focus and on both. Errors are those where the side is told: being on the
     wrong side of focus is what the other hypothesis is for. Raises ``ValueError`` for a model that no gain or no
     temperature in bounds makes right.
     """
-    cases = {side: list(procedural_cases(SCENES, side, FIRST)) for side in PROCEDURAL_SIDES.values()}
     examiner = Examiner(model)
     seen = [examiner.answer(case)[0].blur for case in itertools.chain(*cases.values())]
     gain = _told(model, "blur_gain", blur_gain(Pixels.joined([blur for blur in seen if blur is not None])))

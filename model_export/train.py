@@ -153,6 +153,35 @@ class Pool:
             self.samples.append(next(self.stream))
 
 
+class Pools:
+    """A pool, and one of larger pictures where some steps have those: which is a step's follows from its number."""
+
+    def __init__(self, config: TrainConfig, material: Material, step: int, workers: int, device: str = "cpu") -> None:
+        self.large_share = config.large_share
+        configs = [config, config.enlarged()] if config.large_share else [config]
+        own = -(-workers // len(configs))
+        self.pools = [Pool(each, material, step, own, device) for each in configs]
+        self.size = sum(each.pool for each in configs)
+
+    def fill(self) -> Iterator[int]:
+        """Bring the pools to their state at the first step, one scene at a time."""
+        return (number for pool in self.pools for number in pool.fill())
+
+    def batch(self, step: int) -> Batch:
+        """The batch of a step."""
+        is_large = int((step + 1) * self.large_share) > int(step * self.large_share)
+        return self.pools[is_large].batch(step)
+
+    def settling(self) -> Iterator[Batch]:
+        """Batches that no step draws, for batch norms to settle on: not of larger pictures."""
+        return self.pools[0].settling()
+
+    def refresh(self, step: int) -> None:
+        """Let in the new scenes that come after this step."""
+        for pool in self.pools:
+            pool.refresh(step)
+
+
 def collate(samples: list[Sample], rng: np.random.Generator, config: TrainConfig = UNCHANGED) -> Batch:
     """Samples to tensors, flipped and turned at random, focal length shown or not, gamma told or guessed.
 
@@ -508,37 +537,37 @@ def train(
     path = run / "checkpoint.pt"
     trainer, start = _opened(config, path, weights, teachers, device, fresh_decoders=fresh_decoders)
     config = trainer.config
-    pool = Pool(config, material, trainer.step, workers, device)
+    pools = Pools(config, material, trainer.step, workers, device)
     test = held_out(config.scenes, material, min(2 * config.batch, MOST_HELD_OUT)).changed(trainer.moved)
     # by itself not on a core with a worker: two busy processes there cost each far more than half its speed
     with torch_threads(threads or max(1, available_cores() - workers)), progress_bar(console) as progress:
-        for _ in progress.track(pool.fill(), total=config.pool, description="scenes"):
+        for _ in progress.track(pools.fill(), total=pools.size, description="scenes"):
             pass
         if start is not None and weights is not None:
             if weights.is_dir():
                 start.modules().to(trainer.device)
                 spread_norms(
-                    start, (partial(run_pair, start, batch.changed(trainer.moved)) for batch in pool.settling())
+                    start, (partial(run_pair, start, batch.changed(trainer.moved)) for batch in pools.settling())
                 )
             trainer.begin_with(with_fresh_decoders(start) if fresh_decoders else start)
         task = progress.add_task("training", total=config.steps, completed=trainer.step)
-        for said in _steps(trainer, pool, test, path):
+        for said in _steps(trainer, pools, test, path):
             progress.update(task, completed=trainer.step)
             if said is not None:
                 console.print(said)
     return path
 
 
-def _steps(trainer: Trainer, pool: Pool, test: Batch, path: Path) -> Iterator[str | None]:
+def _steps(trainer: Trainer, pools: Pools, test: Batch, path: Path) -> Iterator[str | None]:
     """Take the steps that a run has left, one at a time; what there is to say where a checkpoint was saved."""
     config, pace = trainer.config, Pace()
     recent: list[dict[str, Tensor]] = []
     while trainer.step < config.steps:
         if trainer.step == settling_step(config) > 0:
-            trainer.settle(pool.settling())
-        recent.append(trainer.advance(pool.batch(trainer.step)))
+            trainer.settle(pools.settling())
+        recent.append(trainer.advance(pools.batch(trainer.step)))
         with pace.waiting():
-            pool.refresh(trainer.step - 1)
+            pools.refresh(trainer.step - 1)
         if trainer.step % config.checkpoint_every and trainer.step < config.steps:
             yield None
             continue

@@ -24,7 +24,7 @@ from model_export.scenes import Material, draw_sample
 from model_export.textures import load_photographs
 from model_export.train import (
     Checkpoint,
-    Pool,
+    Pools,
     Trainer,
     collate,
     emphasis,
@@ -184,20 +184,31 @@ def test_a_run_that_begins_with_weights_keeps_their_statistics(textures: Path, t
     assert any(not torch.equal(second.modules[name], own) for name, own in first.modules.items())
 
 
-def test_a_stopped_run_goes_on_as_if_it_had_not_been_stopped(textures: Path, tmp_path: Path) -> None:
-    whole, _ = run(CONFIG, textures, tmp_path / "whole")
+@pytest.mark.parametrize("large_share", [0.0, 0.5])
+def test_a_stopped_run_goes_on_as_if_it_had_not_been_stopped(
+    textures: Path, tmp_path: Path, large_share: float
+) -> None:
+    config = replace(CONFIG, large_share=large_share)
+    whole, _ = run(config, textures, tmp_path / "whole")
     (tmp_path / "stopped").mkdir()
-    halfway = Trainer(CONFIG, "cpu")
-    pool = Pool(CONFIG, Material(load_photographs(textures)), 0, 0)
+    halfway = Trainer(config, "cpu")
+    pool = Pools(config, Material(load_photographs(textures)), 0, 0)
     list(pool.fill())
     with torch_threads(available_cores()):  # as without workers: other threads round otherwise
         for step in range(3):
             halfway.advance(pool.batch(step))
             pool.refresh(step)
     halfway.checkpoint().save(tmp_path / "stopped" / "checkpoint.pt")
-    resumed, _ = run(CONFIG, textures, tmp_path / "stopped")
+    resumed, _ = run(config, textures, tmp_path / "stopped")
     for name, weight in whole.modules.items():
         torch.testing.assert_close(resumed.modules[name], weight, msg=name)
+
+
+def test_some_steps_have_fewer_and_larger_pictures(textures: Path) -> None:
+    pools = Pools(replace(CONFIG, batch=8, large_share=0.34), Material(load_photographs(textures)), 0, 0)
+    assert len(list(pools.fill())) == pools.size
+    shapes = [tuple(pools.batch(step).image.shape) for step in range(6)]
+    assert shapes == 2 * [(8, 3, 32, 32), (8, 3, 32, 32), (2, 3, 64, 64)]
 
 
 def test_a_run_is_the_same_whoever_draws_its_scenes(textures: Path, tmp_path: Path) -> None:
