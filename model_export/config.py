@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import TypeAdapter, ValidationError
 
-LARGER = 4  # times as many pixels
+LARGER = 2  # times as wide and as high
 LARGE_SEED = 2**16  # larger pictures' seed is so much above
 
 Kind = Literal["compact", "paper"]
@@ -103,10 +103,10 @@ class TrainConfig:
         return replace(
             self,
             seed=self.seed + LARGE_SEED,
-            batch=max(1, self.batch // LARGER),
-            pool=max(1, self.pool // LARGER),
-            fresh_per_step=self.fresh_per_step / LARGER,
-            scenes=replace(self.scenes, size_px=2 * self.scenes.size_px),
+            batch=max(1, self.batch // LARGER**2),
+            pool=max(1, self.pool // LARGER**2),
+            fresh_per_step=self.fresh_per_step / LARGER**2,
+            scenes=replace(self.scenes, size_px=LARGER * self.scenes.size_px),
         )
 
     def as_dict(self) -> dict[str, Any]:

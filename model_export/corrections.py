@@ -10,7 +10,7 @@ from model_export.cases import PROCEDURAL_SIDES, Case, procedural_cases
 from model_export.evaluate import Examiner, Pixels
 from service.inference.artifact import Manifest, load_model_folder, write_manifest
 
-SCENES = 200  # of each side: of 40 the temperature has a standard error of a tenth
+SCENES = 200  # of each side: the temperature's standard error is 0.04
 FIRST = 2**20  # far from the scenes that evaluation draws
 WELL_READ_PX = (1.0, 8.0)
 HELD = ((1, 0.68), (2, 0.95))  # what intervals of so many deviations should hold
