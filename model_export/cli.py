@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Column, Table
 
-from model_export.config import Kind, TrainConfig
+from model_export.config import Kind, Part, TrainConfig
 from model_export.progress import progress_bar
 from service.config import INT8
 
@@ -150,13 +150,14 @@ def average(
     share: Annotated[
         float, typer.Option(min=-1, max=1, help="the second's part; below 0 beyond the first, away from the second")
     ] = 0.5,
+    part: Annotated[Part | None, typer.Option(help="of that alone; the rest stays the first's")] = None,
 ) -> None:
     """Mean of the weights of two checkpoints, one trained on from the other."""
     with _training_parts():
         from model_export.train import Checkpoint
 
     try:
-        mean = Checkpoint.load(first).averaged(Checkpoint.load(second), share)
+        mean = Checkpoint.load(first).averaged(Checkpoint.load(second), share, part or "")
     except ValueError as exc:
         raise _fail(str(exc)) from exc
     mean.save(out)

@@ -12,6 +12,7 @@ LARGE_SEED = 2**16  # larger pictures' seed is so much above
 
 Kind = Literal["compact", "paper"]
 Learning = Literal["all", "depth", "layout"]
+Part = Literal["blur", "depth", "depth.layout"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +64,8 @@ class TrainConfig:
     The last ``settled_share`` of the steps has the batch norms' statistics fixed, as the exported network has: all of
     them in a run that begins with weights, decoders' too. A ``taught`` run learns teachers' answers too, the side of
     focus among them where ``side_weight`` is 0 or the layout is what is learned, of two of four mirror images or of
-    ``all_mirrors``. ``learning`` is what moves: all or the depth network alone, either without what tells the side by
+    ``all_mirrors``; ``teacher_shares`` are each one's in the side, and in all else, alike if there are none.
+    ``learning`` is what moves: all or the depth network alone, either without what tells the side by
     the layout, or that alone. Of the pictures ``turned_share`` do not stay upright, for ``hint_share`` a side is asked
     for; ``faded_share`` lose contrast and ``dimmed_share`` light before what learns, but no teacher, sees them. Of the
     steps ``large_share`` have a quarter as many, twice as large. With ``retaken`` the pool holds scenes, not pictures:
@@ -83,6 +85,7 @@ class TrainConfig:
     side_weight: float = 0.3
     taught: bool = False
     all_mirrors: bool = False
+    teacher_shares: tuple[tuple[float, float], ...] = ()
     learning: Learning = "all"
     likeness_weight: float = 10.0
     pool: int = 600
@@ -120,7 +123,8 @@ class TrainConfig:
         scenes: dict[str, Any] = {
             name: tuple(value) if isinstance(value, list) else value for name, value in values["scenes"].items()
         }
-        return cls(**{**values, "scenes": SceneConfig(**scenes)})
+        shares = tuple(map(tuple, values.get("teacher_shares", ())))
+        return cls(**{**values, "scenes": SceneConfig(**scenes), "teacher_shares": shares})
 
     def adjusted(self, settings: Iterable[str]) -> "TrainConfig":
         """This one with values given as ``name=JSON``, those of the scenes as ``scenes.name=JSON``.

@@ -172,9 +172,18 @@ def _write(
 
 
 def finish(path: Path) -> None:
-    """Check a graph's file, and leave out where on whose disk its operators were written, as the exporter notes."""
+    """Check a graph's file, and leave out where on whose disk its operators were written, as the exporter notes.
+
+    What is added to an enlarged map is said to be of one size with it, which ONNX Runtime does not see by itself: it
+    computes the sum within a convolution then.
+    """
     model = onnx.load(path)
     graph = model.graph
+    shapes = {value.name: value.type for value in graph.value_info}
+    enlarged = {node.output[0] for node in graph.node if node.op_type == "Resize"} & shapes.keys()
+    for node in graph.node:
+        if node.op_type == "Add" and node.input[0] in enlarged:
+            shapes[node.input[1]].CopyFrom(shapes[node.input[0]])
     for part in (model, graph, *graph.node, *graph.value_info, *graph.input, *graph.output, *graph.initializer):
         part.ClearField("metadata_props")
     onnx.checker.check_model(model, full_check=True)

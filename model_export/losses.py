@@ -121,42 +121,51 @@ def standing_out(log_truth: Tensor, emphasis: float | Tensor = 1.0) -> Tensor:
     return weight / weight.mean()
 
 
-def told_by(teachers: Sequence[Pair], batch: Batch) -> tuple[BlurEstimate, DepthEstimate]:
+def told_by(
+    teachers: Sequence[Pair], batch: Batch, shares: Sequence[tuple[float, float]] = ()
+) -> tuple[BlurEstimate, DepthEstimate]:
     """What pairs answer on average, in logarithms and logits: of different descent, they err differently.
 
     So does one pair of a picture and of its mirror images: the mean over the batch's ``mirrors`` is taken too. The side
-    is asked of upright ones alone: what is lower is nearer.
+    is asked of upright ones alone: what is lower is nearer. ``shares`` are each teacher's in the side, and in all else.
     """
+    weighed = zip(teachers, shares or [(1.0, 1.0)] * len(teachers), strict=True)
+    asked = [(teacher, mirror, share) for teacher, share in weighed for mirror in batch.mirrors]
+    of_side = [share[0] * (mirror in UPRIGHT) for _, mirror, share in asked]
+    of_answer = [share[1] for *_, share in asked]
 
-    def mean(maps: Iterable[Tensor]) -> Tensor:
-        return torch.stack([back.flip(mirror) for back, mirror in zip(maps, mirrors, strict=True)]).mean(0)
+    def mean(maps: Iterable[Tensor], weights: Sequence[float]) -> Tensor:
+        parts = zip(maps, asked, weights, strict=True)
+        return torch.stack([weight * one.flip(mirror) for one, (_, mirror, _), weight in parts]).sum(0) / sum(weights)
 
-    mirrors = batch.mirrors * len(teachers)
-    seen = [replace(batch, image=batch.image.flip(mirror)) for mirror in batch.mirrors]
     with torch.no_grad():
-        blurs, depths = zip(*(run_pair(teacher, view) for teacher in teachers for view in seen), strict=True)
-        blur_px = torch.exp(mean(torch.log(blur.blur_px) for blur in blurs))
-        upright = (
-            depth.near_logit.flip(mirror) for depth, mirror in zip(depths, mirrors, strict=True) if mirror in UPRIGHT
-        )
+        answers = [run_pair(teacher, replace(batch, image=batch.image.flip(mirror))) for teacher, mirror, _ in asked]
+        blurs, depths = zip(*answers, strict=True)
+        blur_px = torch.exp(mean((torch.log(blur.blur_px) for blur in blurs), of_answer))
         depth = DepthEstimate(
-            mean(depth.log_ratio_near for depth in depths),
-            mean(depth.log_ratio_far for depth in depths),
-            torch.stack(list(upright)).mean(0),
-            mean(depth.log_scale for depth in depths),
+            mean((depth.log_ratio_near for depth in depths), of_answer),
+            mean((depth.log_ratio_far for depth in depths), of_answer),
+            mean((depth.near_logit for depth in depths), of_side),
+            mean((depth.log_scale for depth in depths), of_answer),
         )
-        return BlurEstimate(blur_px, mean(blur.log_error for blur in blurs), ()), depth
+        return BlurEstimate(blur_px, mean((blur.log_error for blur in blurs), of_answer), ()), depth
 
 
 def likeness_loss(
-    blur: BlurEstimate, depth: DepthEstimate, teachers: Sequence[Pair], batch: Batch, *, of_side: bool = False
+    blur: BlurEstimate,
+    depth: DepthEstimate,
+    teachers: Sequence[Pair],
+    batch: Batch,
+    shares: Sequence[tuple[float, float]] = (),
+    *,
+    of_side: bool = False,
 ) -> Tensor:
     """How far the answers are from the teachers', most where these are sure: float32 scalar.
 
     But for the side, if not asked for: how often it is near is that of the scenes a teacher saw. Teachers see the
     picture with all its contrast and light; how sure they are of it says nothing of a worn one.
     """
-    wise_blur, wise_depth = told_by(teachers, batch)
+    wise_blur, wise_depth = told_by(teachers, batch, shares)
     sure_blur = torch.exp(-BETA * wise_blur.log_error)
     sure_depth = torch.exp(-BETA * wise_depth.log_scale) / 2
     of_blur = sure_blur * (torch.log(blur.blur_px) - torch.log(wise_blur.blur_px)).abs()
@@ -193,6 +202,6 @@ def total_loss(
     parts = {"loss": loss, "blur": blur_error.mean(), "depth": (asked * depth_error).sum() / asked.sum(), "side": side}
     if teachers:
         of_side = config.learning == "layout" or not config.side_weight
-        parts["likeness"] = likeness_loss(blur, depth, teachers, batch, of_side=of_side)
+        parts["likeness"] = likeness_loss(blur, depth, teachers, batch, config.teacher_shares, of_side=of_side)
         parts["loss"] = loss + config.likeness_weight * parts["likeness"]
     return parts["loss"], {name: part.detach() for name, part in parts.items()}

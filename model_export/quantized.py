@@ -1,38 +1,38 @@
-"""The pair in int8: U8S8, per channel; front ends, what sees their energies, and the last convolutions stay in float32.
+"""The pair in int8: U8S8, per channel; the front end and what sees the picture stay in float32, and so do answers.
 
 Weights have seven bits (``reduce_range``), because AVX2 without integer dot products adds pairs of products in sixteen.
+Where int8 and float32 meet, maps are turned round in memory and bytes made numbers, or numbers bytes, each at the price
+of a small convolution. So heads, which see one cell each, are products of bytes, and features go from graph to graph as
+bytes, channels last.
 """
 
-import copy
 import logging
 import shutil
 import tempfile
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import onnx
-import torch
 from numpy.typing import NDArray
+from onnx import TensorProto, helper, numpy_helper
 from onnxruntime.quantization import QuantFormat, QuantType, quantize_static
 from onnxruntime.quantization.shape_inference import quant_pre_process
-from torch import Tensor, nn
-from torch.nn import functional
 
 from model_export.config import SceneConfig
 from model_export.export import export_graphs, finish
 from model_export.networks import Pair
 from model_export.scenes import draw_sample
 from model_export.verify import CAMERA, through_torch
-from service.inference.artifact import GraphFile, Graphs, sha256_of
+from service.inference.artifact import GraphFile, Graphs, TensorSpec, sha256_of
 
 SCENES = 48
 FIRST_SEED = 2**41  # neither a training's nor a held-out scene's
 QUANTISED = ("Conv", "Relu", "MaxPool", "Resize", "Add")
-FIRST = "network.unet.encoder.0.layers.0."
-IMAGE = "unet.encoder.0.layers.0.ways.0"
-ENERGIES = "network.unet.encoder.0.layers.0.ways.1."
+FIRST_OF_BLUR, FIRST_OF_DEPTH = "network.unet.encoder.0.layers.1.", "network.unet.encoder.0.layers.0."
+MOST_WEIGHT = 63  # of seven bits
+CHANNELS_LAST, CHANNELS_FIRST = (0, 2, 3, 1), (0, 3, 1, 2)
+FEATURES = "features"
 
 Feeds = dict[str, NDArray[np.float32]]
 
@@ -47,50 +47,25 @@ class _Feeds:
         return next(self._feeds, None)
 
 
-class Cells(nn.Module):
-    """A picture [n,c,h,w] by the four pixels of its cells of 2x2: [n,4c,h/2,w/2]."""
-
-    pixels: Tensor
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.register_buffer("pixels", torch.eye(4 * channels).reshape(4 * channels, channels, 2, 2), persistent=False)
-
-    def forward(self, picture: Tensor) -> Tensor:
-        return functional.conv2d(picture, self.pixels, stride=2)
-
-
-def through_cells(pair: Pair) -> Pair:
-    """A copy of the compact pair that answers the same: its convolution over every other pixel sees cells of four.
-
-    Of few channels and a large kernel ONNX Runtime's convolution in int8 spends its time on gathering pixels.
-    """
-    blur = copy.deepcopy(pair.blur)
-    over_pixels = blur.get_submodule(IMAGE)
-    if isinstance(over_pixels, nn.Conv2d) and over_pixels.stride == (2, 2):
-        kernels = functional.pixel_unshuffle(over_pixels.weight.detach(), 2)
-        outputs, maps, size, _ = kernels.shape
-        over_cells = nn.Conv2d(maps, outputs, size, padding=size // 2, bias=False)
-        over_cells.weight = nn.Parameter(kernels)
-        blur.set_submodule(IMAGE, nn.Sequential(Cells(over_pixels.in_channels), over_cells))
-    return replace(pair, blur=blur)
-
-
 def quantised_graphs(pair: Pair, folder: Path) -> Graphs:
     """Write both graphs in int8, their ranges taken from generated scenes; what the manifest says of all.
 
     The layout's own graph, which large pictures alone need, and once, stays as it is.
     """
     with tempfile.TemporaryDirectory() as scratch:
-        graphs = export_graphs(through_cells(pair), Path(scratch))
-        blur, depth = zip(*_scene_feeds(pair, graphs.feature_names), strict=True)
+        graphs = export_graphs(pair, Path(scratch))
+        seen, asked = zip(*_scene_feeds(pair, graphs.feature_names), strict=True)
+        blur = _quantised(Path(scratch, graphs.blur.file), list(seen), FIRST_OF_BLUR)
+        depth = _quantised(Path(scratch, graphs.depth.file), list(asked), FIRST_OF_DEPTH)
         if graphs.layout:
             shutil.copy(Path(scratch, graphs.layout.file), folder)
-        return Graphs(
-            blur=_quantised(graphs.blur, Path(scratch), list(blur), folder, in_float=(ENERGIES,)),
-            depth=_quantised(graphs.depth, Path(scratch), list(depth), folder),
-            layout=graphs.layout,
-        )
+    for model in (blur, depth):
+        _answer_from_bytes(model)
+    if graphs.feature_names == (FEATURES,):
+        _take_bytes(depth, blur)
+    return Graphs(
+        blur=_written(blur, graphs.blur, folder), depth=_written(depth, graphs.depth, folder), layout=graphs.layout
+    )
 
 
 def _scene_feeds(pair: Pair, feature_names: tuple[str, ...]) -> Iterator[tuple[Feeds, Feeds]]:
@@ -102,36 +77,104 @@ def _scene_feeds(pair: Pair, feature_names: tuple[str, ...]) -> Iterator[tuple[F
         yield {"image": image}, through_torch(pair, image, camera, feature_names)[1]
 
 
-def _quantised(
-    graph: GraphFile, scratch: Path, feeds: list[Feeds], folder: Path, in_float: tuple[str, ...] = ()
-) -> GraphFile:
-    prepared = scratch / f"prepared-{graph.file}"
-    quant_pre_process(scratch / graph.file, prepared, skip_symbolic_shape=True)
+def _quantised(path: Path, feeds: list[Feeds], first: str) -> onnx.ModelProto:
+    """A graph in int8 from that layer up to the last convolution, which is not."""
+    prepared = path.with_name(f"prepared-{path.name}")
+    quant_pre_process(path, prepared, skip_symbolic_shape=True)
     level = logging.root.level
     logging.root.setLevel(logging.ERROR)  # it warns of what has been done
     try:
         quantize_static(
             prepared,
-            folder / graph.file,
+            path,
             _Feeds(feeds),
             quant_format=QuantFormat.QDQ,
             activation_type=QuantType.QUInt8,
             weight_type=QuantType.QInt8,
             per_channel=True,
             reduce_range=True,
-            nodes_to_quantize=_from_first_to_last(onnx.load(prepared), in_float),
+            nodes_to_quantize=_from_first_to_last(onnx.load(prepared), first),
         )
     finally:
         logging.root.setLevel(level)
-    finish(folder / graph.file)
-    return graph.model_copy(update={"sha256": sha256_of(folder / graph.file)})
+    return onnx.load(path)
 
 
-def _from_first_to_last(model: onnx.ModelProto, in_float: tuple[str, ...]) -> list[str]:
-    """Nodes from the first convolution of the network up to its last, but for that one and those named."""
+def _from_first_to_last(model: onnx.ModelProto, first: str) -> list[str]:
+    """Nodes from the first convolution whose weights are named so up to the last one, but for that."""
     nodes = list(model.graph.node)
     kernels = {i: node.input[1] for i, node in enumerate(nodes) if node.op_type == "Conv"}
-    first = min(i for i, name in kernels.items() if name.startswith(FIRST))
-    left = {nodes[i].name for i, name in kernels.items() if name.startswith(in_float)}
-    inner = nodes[first : max(kernels)]
-    return [node.name for node in inner if node.op_type in QUANTISED and node.name not in left]
+    begin = min(i for i, name in kernels.items() if name.startswith(first))
+    return [node.name for node in nodes[begin : max(kernels)] if node.op_type in QUANTISED]
+
+
+def _answer_from_bytes(model: onnx.ModelProto) -> None:
+    """Make a head, which sees one cell each, a product of the bytes [n,h,w,c] that its numbers are made from.
+
+    Where those numbers left the graph as features, the bytes do.
+    """
+    graph = model.graph
+    values = {tensor.name: tensor for tensor in graph.initializer}
+    head = [node for node in graph.node if node.op_type == "Conv"][-1]
+    numbers = next(node for node in graph.node if node.output[0] == head.input[0])
+    kernel, bias = (numpy_helper.to_array(values[name]) for name in head.input[1:])
+    weights = kernel[:, :, 0, 0].T
+    scale = np.abs(weights).max(0) / np.float32(MOST_WEIGHT)
+    constants = {
+        "head.bytes": np.round(weights / scale).astype(np.int8),
+        "head.scale": scale,
+        "head.zero": np.zeros(len(scale), np.int8),
+        "head.bias": bias[:, None, None],
+    }
+    cells = FEATURES if numbers.output[0] == FEATURES else "head.cells"
+    nodes = [
+        helper.make_node("Transpose", [numbers.input[0]], [cells], perm=CHANNELS_LAST),
+        helper.make_node("DequantizeLinear", [cells, *numbers.input[1:]], ["head.numbers"]),
+        helper.make_node("DequantizeLinear", ["head.bytes", "head.scale", "head.zero"], ["head.weights"], axis=1),
+        helper.make_node("MatMul", ["head.numbers", "head.weights"], ["head.sums"]),
+        helper.make_node("Transpose", ["head.sums"], ["head.maps"], perm=CHANNELS_FIRST),
+        helper.make_node("Add", ["head.maps", "head.bias"], head.output),
+    ]
+    at = list(graph.node).index(head)
+    after = list(graph.node)[at + 1 :]
+    del graph.node[at:]
+    graph.node.remove(numbers)
+    graph.node.extend([*nodes, *after])
+    for name in head.input[1:]:
+        graph.initializer.remove(values[name])
+    graph.initializer.extend(numpy_helper.from_array(value, name) for name, value in constants.items())
+
+
+def _take_bytes(depth: onnx.ModelProto, blur: onnx.ModelProto) -> None:
+    """Have features go from graph to graph as bytes [n,h,w,c], by the blur graph's scale."""
+    made = next(node for node in depth.graph.node if node.input[0] == FEATURES)
+    own, others = ({tensor.name: tensor for tensor in model.graph.initializer} for model in (depth, blur))
+    for name in made.input[1:]:
+        own[name].CopyFrom(others[name])
+    made.CopyFrom(helper.make_node("Transpose", [FEATURES], made.output, perm=CHANNELS_FIRST))
+    for value in (*blur.graph.output, *depth.graph.input):
+        if value.name == FEATURES:
+            sizes = [size.dim_param or size.dim_value for size in value.type.tensor_type.shape.dim]
+            turned = [sizes[axis] for axis in CHANNELS_LAST]
+            value.type.CopyFrom(helper.make_tensor_type_proto(TensorProto.UINT8, turned))
+
+
+def _written(model: onnx.ModelProto, graph: GraphFile, folder: Path) -> GraphFile:
+    """Write a graph; what the manifest says of it, features being as it takes or gives them."""
+    path = folder / graph.file
+    onnx.save(model, path)
+    finish(path)
+    in_bytes = {
+        value.name
+        for value in (*model.graph.input, *model.graph.output)
+        if value.type.tensor_type.elem_type == TensorProto.UINT8
+    }
+    inputs, outputs = (
+        tuple(_turned(spec) if spec.name in in_bytes else spec for spec in specs)
+        for specs in (graph.inputs, graph.outputs)
+    )
+    return graph.model_copy(update={"sha256": sha256_of(path), "inputs": inputs, "outputs": outputs})
+
+
+def _turned(spec: TensorSpec) -> TensorSpec:
+    return spec.model_copy(update={"shape": tuple(spec.shape[axis] for axis in CHANNELS_LAST)})

@@ -281,8 +281,10 @@ class Checkpoint:
             raise ValueError(f"{path} was written by another version of camind: {exc}") from exc
         return cls(config, content["step"], content["modules"], content.get("optimizers", []))
 
-    def averaged(self, other: "Checkpoint", share: float = 0.5) -> "Checkpoint":
+    def averaged(self, other: "Checkpoint", share: float = 0.5, part: str = "") -> "Checkpoint":
         """This one with its weights moved by ``share`` towards another run's, one of them trained on from the other.
+
+        Only those of a ``part`` where one is named: ``blur``, ``depth`` or ``depth.layout``.
 
         Of two such runs the mean is often better than either (Izmailov et al. 2018). A share below 0 goes on past this
         one, away from the other, as a longer run might have; a batch norm's variance no further than to 0. Raises
@@ -290,9 +292,10 @@ class Checkpoint:
         """
         if other.config.kind != self.config.kind:
             raise ValueError(f"weights of a {self.config.kind} and a {other.config.kind} pair have no mean")
-        modules = {
-            name: torch.lerp(own, other.modules[name], share) if own.is_floating_point() else own
+        modules = self.modules | {
+            name: torch.lerp(own, other.modules[name], share)
             for name, own in self.modules.items()
+            if own.is_floating_point() and name.startswith(part)
         }
         modules |= {name: v.clamp_min(0) for name, v in modules.items() if name.endswith("running_var")}
         return replace(self, modules=modules, step=self.step + other.step)
@@ -412,7 +415,13 @@ class Trainer:
         self.modules.load_state_dict(pair.modules().state_dict())
 
     def learn_from(self, *teachers: Pair) -> None:
-        """Have what a batch costs include how far the answers are from the mean of other pairs'."""
+        """Have what a batch costs include how far the answers are from the mean of other pairs'.
+
+        Raises ``ValueError`` for shares of other teachers than these.
+        """
+        shares = self.config.teacher_shares
+        if shares and len(shares) != len(teachers):
+            raise ValueError(f"{len(shares)} teacher_shares are not those of {len(teachers)} teachers")
         self.teachers = [folded(teacher) for teacher in teachers]
         for teacher in self.teachers:
             convert_conv2d_weight_memory_format(teacher.modules().to(self.device), torch.channels_last)

@@ -45,8 +45,9 @@ def verify_pair(pair: Pair, folder: Path) -> list[Difference]:
     for height, width in SIZES:
         image = _picture(height, width)
         expected, feeds = through_torch(pair, image, CAMERA, loaded.manifest.graphs.feature_names)
-        told = _run(depth, feeds)
-        differences += _differences(expected, _run(blur, {"image": image}) | told, height, width)
+        seen = _run(blur, {"image": image})
+        told = _run(depth, feeds | seen)
+        differences += _differences(expected, seen | told, height, width)
         if loaded.layout_graph is not None:
             layout = onnxruntime.InferenceSession(loaded.layout_graph, options, providers=providers)
             alone = {LAYOUT_ODDS: expected[LAYOUT_ODDS]}
@@ -96,7 +97,6 @@ def through_torch(
         "log_ratio_far": told.log_ratio_far.numpy(),
         "p_near": torch.sigmoid(told.near_logit).numpy(),
         "log_scale": told.log_scale.numpy(),
-        **features,
     }
     if isinstance(told, LaidOutEstimate):
         expected |= {LAYOUT_MAP: told.layout_map.numpy(), LAYOUT_ODDS: told.layout_odds.numpy()}

@@ -2,7 +2,9 @@
 
 from pathlib import Path
 
+import numpy as np
 import onnx
+import onnxruntime
 import pytest
 import torch
 
@@ -55,18 +57,45 @@ def test_onnx_runtime_answers_as_torch_on_three_sizes(exported: tuple[Pair, Path
 
 
 def test_int8_answers_nearly_as_torch_and_computes_in_int8(in_int8: tuple[Pair, Path]) -> None:
-    blur = [d.relative for d in verify_pair(*in_int8) if d.output == "blur_px"]
-    assert 0 < max(blur) < INT8_TOLERANCE
+    differences = verify_pair(*in_int8)
+    assert 0 < max(d.relative for d in differences if d.output == "blur_px") < INT8_TOLERANCE
+    assert max(d.relative for d in differences if d.output.startswith("log_ratio")) < INT8_TOLERANCE
     folder = load_model_folder(in_int8[1])
-    for graph in (folder.blur_graph, folder.depth_graph):
+    seeing = ("network.front.", "network.unet.encoder.0.layers.0.")
+    for graph, may_be_in_float in ((folder.blur_graph, seeing), (folder.depth_graph, ())):
         model = onnx.load(graph)
         made = {name: node.op_type for node in model.graph.node for name in node.output}
         convolutions = [node for node in model.graph.node if node.op_type == "Conv"]
         in_int8_inside = [node for node in convolutions if made.get(node.input[1]) == "DequantizeLinear"]
         in_float = [node.input[1] for node in convolutions if node not in in_int8_inside]
         assert len(in_int8_inside) >= 14
-        assert in_float[-1] == convolutions[-1].input[1]
-        assert all(name.startswith(("network.front.", quantized.ENERGIES)) for name in in_float[:-1])
+        assert all(name.startswith(may_be_in_float) for name in in_float)
+
+
+def test_in_int8_features_are_bytes_that_mean_what_torch_sees(in_int8: tuple[Pair, Path]) -> None:
+    pair, folder = in_int8[0], load_model_folder(in_int8[1])
+    graphs = folder.manifest.graphs
+    given, taken = (
+        next(spec for spec in specs if spec.name == "features") for specs in (graphs.blur.outputs, graphs.depth.inputs)
+    )
+    assert given == taken
+    assert given.shape == ("n", "h/2", "w/2", 16)
+    image = torch.rand(1, 3, 64, 96)
+    session = onnxruntime.InferenceSession(folder.blur_graph, providers=["CPUExecutionProvider"])
+    (features,) = session.run(["features"], {"image": image.numpy()})
+    assert features.dtype == np.uint8
+    scale, zero = (constant(folder.blur_graph, f"features_{name}") for name in ("scale", "zero_point"))
+    assert (scale, zero) == tuple(constant(folder.depth_graph, f"features_{n}") for n in ("scale", "zero_point"))
+    with torch.inference_mode():
+        (expected,) = pair.blur(image).features
+    numbers = (features.astype(np.float32) - zero) * scale
+    off = np.abs(numbers.transpose(0, 3, 1, 2) - expected.numpy()).mean()
+    assert off < INT8_TOLERANCE * float(expected.max())
+
+
+def constant(graph: Path, name: str) -> float:
+    (found,) = (tensor for tensor in onnx.load(graph).graph.initializer if tensor.name == name)
+    return float(onnx.numpy_helper.to_array(found))
 
 
 def test_verify_notices_other_weights(exported: tuple[Pair, Path]) -> None:
