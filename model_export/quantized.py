@@ -2,8 +2,8 @@
 
 Weights have seven bits (``reduce_range``), because AVX2 without integer dot products adds pairs of products in sixteen.
 Where int8 and float32 meet, maps are turned round in memory and bytes made numbers, or numbers bytes, each at the price
-of a small convolution. So heads, which see one cell each, are products of bytes, and features go from graph to graph as
-bytes, channels last.
+of a small convolution. So heads, which see one cell each, are products of the numbers as they lie, channels last, and
+features go from graph to graph as bytes.
 """
 
 import logging
@@ -30,7 +30,6 @@ SCENES = 48
 FIRST_SEED = 2**41  # neither a training's nor a held-out scene's
 QUANTISED = ("Conv", "Relu", "MaxPool", "Resize", "Add")
 FIRST_OF_BLUR, FIRST_OF_DEPTH = "network.unet.encoder.0.layers.1.", "network.unet.encoder.0.layers.0."
-MOST_WEIGHT = 63  # of seven bits
 CHANNELS_LAST, CHANNELS_FIRST = (0, 2, 3, 1), (0, 3, 1, 2)
 FEATURES = "features"
 
@@ -60,7 +59,7 @@ def quantised_graphs(pair: Pair, folder: Path) -> Graphs:
         if graphs.layout:
             shutil.copy(Path(scratch, graphs.layout.file), folder)
     for model in (blur, depth):
-        _answer_from_bytes(model)
+        _answer_by_cell(model)
     if graphs.feature_names == (FEATURES,):
         _take_bytes(depth, blur)
     return Graphs(
@@ -108,29 +107,21 @@ def _from_first_to_last(model: onnx.ModelProto, first: str) -> list[str]:
     return [node.name for node in nodes[begin : max(kernels)] if node.op_type in QUANTISED]
 
 
-def _answer_from_bytes(model: onnx.ModelProto) -> None:
-    """Make a head, which sees one cell each, a product of the bytes [n,h,w,c] that its numbers are made from.
+def _answer_by_cell(model: onnx.ModelProto) -> None:
+    """Make a head, which sees one cell each, a product of float32 [n,h,w,c], and only its answers maps [n,c,h,w].
 
-    Where those numbers left the graph as features, the bytes do.
+    Where its numbers left the graph as features, the bytes do that they are made from.
     """
     graph = model.graph
     values = {tensor.name: tensor for tensor in graph.initializer}
     head = [node for node in graph.node if node.op_type == "Conv"][-1]
     numbers = next(node for node in graph.node if node.output[0] == head.input[0])
-    kernel, bias = (numpy_helper.to_array(values[name]) for name in head.input[1:])
-    weights = kernel[:, :, 0, 0].T
-    scale = np.abs(weights).max(0) / np.float32(MOST_WEIGHT)
-    constants = {
-        "head.bytes": np.round(weights / scale).astype(np.int8),
-        "head.scale": scale,
-        "head.zero": np.zeros(len(scale), np.int8),
-        "head.bias": bias[:, None, None],
-    }
+    weights, bias = (numpy_helper.to_array(values[name]) for name in head.input[1:])
+    constants = {"head.weights": np.ascontiguousarray(weights[:, :, 0, 0].T), "head.bias": bias[:, None, None]}
     cells = FEATURES if numbers.output[0] == FEATURES else "head.cells"
     nodes = [
         helper.make_node("Transpose", [numbers.input[0]], [cells], perm=CHANNELS_LAST),
         helper.make_node("DequantizeLinear", [cells, *numbers.input[1:]], ["head.numbers"]),
-        helper.make_node("DequantizeLinear", ["head.bytes", "head.scale", "head.zero"], ["head.weights"], axis=1),
         helper.make_node("MatMul", ["head.numbers", "head.weights"], ["head.sums"]),
         helper.make_node("Transpose", ["head.sums"], ["head.maps"], perm=CHANNELS_FIRST),
         helper.make_node("Add", ["head.maps", "head.bias"], head.output),
