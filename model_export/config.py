@@ -65,11 +65,11 @@ class TrainConfig:
     them in a run that begins with weights, decoders' too. A ``taught`` run learns teachers' answers too, the side of
     focus among them where ``side_weight`` is 0 or the layout is what is learned, of two of four mirror images or of
     ``all_mirrors``; ``teacher_shares`` are each one's in the side, and in all else, alike if there are none.
-    ``learning`` is what moves: all or the depth network alone, either without what tells the side by
-    the layout, or that alone. Of the pictures ``turned_share`` do not stay upright, for ``hint_share`` a side is asked
-    for; ``faded_share`` lose contrast and ``dimmed_share`` light before what learns, but no teacher, sees them. Of the
-    steps ``large_share`` have a quarter as many, twice as large. With ``retaken`` the pool holds scenes, not pictures:
-    each batch takes pictures of its own of them, where steps are computed (``darkroom.py``).
+    ``learning`` is what moves: all or the depth network alone, either without what tells the side by the layout, or
+    that alone. Of the pictures ``turned_share`` do not stay upright, for ``hint_share`` a side is asked for;
+    ``faded_share`` lose contrast and ``dimmed_share`` light before what learns, but no teacher, sees them. Of the steps
+    ``large_share`` have a quarter as many, twice as large. With ``retaken`` the pool holds scenes, not pictures: each
+    batch takes pictures of its own of them, where steps are computed (``darkroom.py``).
     """
 
     kind: Kind = "compact"

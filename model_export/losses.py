@@ -139,7 +139,8 @@ def told_by(
         return torch.stack([weight * one.flip(mirror) for one, (_, mirror, _), weight in parts]).sum(0) / sum(weights)
 
     with torch.no_grad():
-        answers = [run_pair(teacher, replace(batch, image=batch.image.flip(mirror))) for teacher, mirror, _ in asked]
+        views = {mirror: replace(batch, image=batch.image.flip(mirror)) for mirror in batch.mirrors}
+        answers = [run_pair(teacher, views[mirror]) for teacher, mirror, _ in asked]
         blurs, depths = zip(*answers, strict=True)
         blur_px = torch.exp(mean((torch.log(blur.blur_px) for blur in blurs), of_answer))
         depth = DepthEstimate(

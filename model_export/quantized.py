@@ -20,7 +20,7 @@ from onnxruntime.quantization import QuantFormat, QuantType, quantize_static
 from onnxruntime.quantization.shape_inference import quant_pre_process
 
 from model_export.config import SceneConfig
-from model_export.export import export_graphs, finish
+from model_export.export import export_graphs, feature_names, finish
 from model_export.networks import Pair
 from model_export.scenes import draw_sample
 from model_export.verify import CAMERA, through_torch
@@ -31,7 +31,7 @@ FIRST_SEED = 2**41  # neither a training's nor a held-out scene's
 QUANTISED = ("Conv", "Relu", "MaxPool", "Resize", "Add")
 FIRST_OF_BLUR, FIRST_OF_DEPTH = "network.unet.encoder.0.layers.1.", "network.unet.encoder.0.layers.0."
 CHANNELS_LAST, CHANNELS_FIRST = (0, 2, 3, 1), (0, 3, 1, 2)
-FEATURES = "features"
+(FEATURES,) = feature_names(1)
 
 Feeds = dict[str, NDArray[np.float32]]
 
@@ -155,13 +155,8 @@ def _written(model: onnx.ModelProto, graph: GraphFile, folder: Path) -> GraphFil
     path = folder / graph.file
     onnx.save(model, path)
     finish(path)
-    in_bytes = {
-        value.name
-        for value in (*model.graph.input, *model.graph.output)
-        if value.type.tensor_type.elem_type == TensorProto.UINT8
-    }
     inputs, outputs = (
-        tuple(_turned(spec) if spec.name in in_bytes else spec for spec in specs)
+        tuple(_turned(spec) if spec.name == FEATURES else spec for spec in specs)
         for specs in (graph.inputs, graph.outputs)
     )
     return graph.model_copy(update={"sha256": sha256_of(path), "inputs": inputs, "outputs": outputs})

@@ -70,6 +70,8 @@ def test_int8_answers_nearly_as_torch_and_computes_in_int8(in_int8: tuple[Pair, 
         in_float = [node.input[1] for node in convolutions if node not in in_int8_inside]
         assert len(in_int8_inside) >= 14
         assert all(name.startswith(may_be_in_float) for name in in_float)
+        (head,) = (tensor for tensor in model.graph.initializer if tensor.name == "head.weights")
+        assert head.data_type == onnx.TensorProto.FLOAT
 
 
 def test_in_int8_features_are_bytes_that_mean_what_torch_sees(in_int8: tuple[Pair, Path]) -> None:
