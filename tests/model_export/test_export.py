@@ -10,14 +10,16 @@ import torch
 
 from model_export import quantized
 from model_export.card import record_scores
-from model_export.config import Kind, TrainConfig
+from model_export.config import Kind, SceneConfig, TrainConfig
 from model_export.export import export_pair
 from model_export.networks import CompactDepth, Pair, make_pair
+from model_export.scenes import draw_sample
 from model_export.verify import SIZES, TOLERANCE, verify_pair
 from service.config import INT8, SHIPPED_MODEL
 from service.inference.artifact import load_model_folder
 
 INT8_TOLERANCE = 0.05
+CALIBRATED_ON = 3
 KINDS: list[Kind] = ["compact", "paper"]
 
 
@@ -37,7 +39,7 @@ def untrained(kind: Kind) -> Pair:
 def in_int8(tmp_path_factory: pytest.TempPathFactory) -> tuple[Pair, Path]:
     pair, folder = untrained("compact"), tmp_path_factory.mktemp("int8")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(quantized, "SCENES", 3)
+        patch.setattr(quantized, "SCENES", CALIBRATED_ON)
         export_pair(pair, TrainConfig(), 0, folder, write_graphs=quantized.quantised_graphs)
     return pair, folder
 
@@ -93,6 +95,20 @@ def test_in_int8_features_are_bytes_that_mean_what_torch_sees(in_int8: tuple[Pai
     numbers = (features.astype(np.float32) - zero) * scale
     off = np.abs(numbers.transpose(0, 3, 1, 2) - expected.numpy()).mean()
     assert off < INT8_TOLERANCE * float(expected.max())
+
+
+def test_in_int8_scenes_are_seen_on_average_as_in_float32(in_int8: tuple[Pair, Path]) -> None:
+    pair, graph = in_int8[0], load_model_folder(in_int8[1]).blur_graph
+    session = onnxruntime.InferenceSession(graph, providers=["CPUExecutionProvider"])
+    scale, zero = (constant(graph, f"features_{name}") for name in ("scale", "zero_point"))
+    off_steps = []
+    for number in range(CALIBRATED_ON):
+        image = draw_sample(quantized.FIRST_SEED + number, SceneConfig()).image[None].astype(np.float32) / 255
+        (seen,) = session.run(["features"], {"image": image})
+        with torch.inference_mode():
+            (expected,) = pair.blur(torch.from_numpy(image)).features
+        off_steps.append(seen.mean((0, 1, 2)) - zero - expected.numpy().mean((0, 2, 3)) / scale)
+    assert np.abs(np.mean(off_steps, axis=0)).max() < 0.25  # 1.4 where biases are only rounded
 
 
 def constant(graph: Path, name: str) -> float:
