@@ -82,6 +82,7 @@ def _quantised(path: Path, feeds: list[Feeds], first: str) -> onnx.ModelProto:
     """A graph in int8 from that layer up to the last convolution, which is not."""
     prepared = path.with_name(f"prepared-{path.name}")
     quant_pre_process(path, prepared, skip_symbolic_shape=True)
+    floating = onnx.load(prepared)
     level = logging.root.level
     logging.root.setLevel(logging.ERROR)  # it warns of what has been done
     try:
@@ -94,12 +95,12 @@ def _quantised(path: Path, feeds: list[Feeds], first: str) -> onnx.ModelProto:
             weight_type=QuantType.QInt8,
             per_channel=True,
             reduce_range=True,
-            nodes_to_quantize=_from_first_to_last(onnx.load(prepared), first),
+            nodes_to_quantize=_from_first_to_last(floating, first),
         )
     finally:
         logging.root.setLevel(level)
     model = onnx.load(path)
-    _take_back_shifts(model, onnx.load(prepared), feeds)
+    _take_back_shifts(model, floating, feeds)
     return model
 
 

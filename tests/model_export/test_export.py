@@ -7,6 +7,7 @@ import onnx
 import onnxruntime
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from model_export import quantized
 from model_export.card import record_scores
@@ -84,31 +85,32 @@ def test_in_int8_features_are_bytes_that_mean_what_torch_sees(in_int8: tuple[Pai
     )
     assert given == taken
     assert given.shape == ("n", "h/2", "w/2", 16)
-    image = torch.rand(1, 3, 64, 96)
-    session = onnxruntime.InferenceSession(folder.blur_graph, providers=["CPUExecutionProvider"])
-    (features,) = session.run(["features"], {"image": image.numpy()})
-    assert features.dtype == np.uint8
-    scale, zero = (constant(folder.blur_graph, f"features_{name}") for name in ("scale", "zero_point"))
-    assert (scale, zero) == tuple(constant(folder.depth_graph, f"features_{n}") for n in ("scale", "zero_point"))
-    with torch.inference_mode():
-        (expected,) = pair.blur(image).features
-    numbers = (features.astype(np.float32) - zero) * scale
-    off = np.abs(numbers.transpose(0, 3, 1, 2) - expected.numpy()).mean()
-    assert off < INT8_TOLERANCE * float(expected.max())
+    for name in ("features_scale", "features_zero_point"):
+        assert constant(folder.blur_graph, name) == constant(folder.depth_graph, name)
+    seen, expected = features_seen(pair, folder.blur_graph, torch.rand(1, 3, 64, 96))
+    assert np.abs(seen - expected).mean() < INT8_TOLERANCE * expected.max()
 
 
 def test_in_int8_scenes_are_seen_on_average_as_in_float32(in_int8: tuple[Pair, Path]) -> None:
     pair, graph = in_int8[0], load_model_folder(in_int8[1]).blur_graph
-    session = onnxruntime.InferenceSession(graph, providers=["CPUExecutionProvider"])
-    scale, zero = (constant(graph, f"features_{name}") for name in ("scale", "zero_point"))
-    off_steps = []
+    off = []
     for number in range(CALIBRATED_ON):
-        image = draw_sample(quantized.FIRST_SEED + number, SceneConfig()).image[None].astype(np.float32) / 255
-        (seen,) = session.run(["features"], {"image": image})
-        with torch.inference_mode():
-            (expected,) = pair.blur(torch.from_numpy(image)).features
-        off_steps.append(seen.mean((0, 1, 2)) - zero - expected.numpy().mean((0, 2, 3)) / scale)
-    assert np.abs(np.mean(off_steps, axis=0)).max() < 0.25  # 1.4 where biases are only rounded
+        scene = draw_sample(quantized.FIRST_SEED + number, SceneConfig()).image[np.newaxis]
+        seen, expected = features_seen(pair, graph, torch.from_numpy(scene).float() / 255)
+        off.append((seen - expected).mean((0, 2, 3)))
+    steps = np.mean(off, axis=0) / constant(graph, "features_scale")
+    assert np.abs(steps).max() < 0.25  # 1.4 where biases are only rounded
+
+
+def features_seen(pair: Pair, graph: Path, image: torch.Tensor) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """What the numbers mean that a blur graph in int8 answers as features, and what torch sees: both [n, c, h, w]."""
+    session = onnxruntime.InferenceSession(graph, providers=["CPUExecutionProvider"])
+    (features,) = session.run(["features"], {"image": image.numpy()})
+    assert features.dtype == np.uint8
+    numbers = (features.astype(np.float32) - constant(graph, "features_zero_point")) * constant(graph, "features_scale")
+    with torch.inference_mode():
+        (expected,) = pair.blur(image).features
+    return numbers.transpose(0, 3, 1, 2), expected.numpy()
 
 
 def constant(graph: Path, name: str) -> float:
