@@ -1,12 +1,15 @@
 """Who may do what: API keys in front of every request but those for health and the page, their scopes, and their quota.
 
-Where no key is asked for, whoever is at this machine may do all, and so could any page in their browser: it may not.
+Where no key is asked for, whoever is at this machine may do all, and so could any page in their browser: it may not,
+nor may one whose own name has been bound to this machine (DNS rebinding), for which the browser sees one site in both.
 
 A scope is asked for by path, before a route or a body is looked at; a path that is not named here takes any key.
 """
 
 import math
 import time
+from collections.abc import Collection
+from ipaddress import ip_address
 from urllib.parse import urlsplit
 
 from fastapi.concurrency import run_in_threadpool
@@ -16,14 +19,17 @@ from limits.strategies import MovingWindowRateLimiter
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from service.errors import CrossOrigin, Forbidden, QuotaExceeded, Unauthorized
+from service.errors import CrossOrigin, Forbidden, QuotaExceeded, Unauthorized, UnknownHost
 from service.principal import ANYBODY, Principal
 from service.principal import Scope as KeyScope
 from service.storage.keys import ApiKey, Keys
 
 # the page holds nobody's data, and is what asks for the key
 PAGE = "/"
-PUBLIC = ("/health", "/web")
+HEALTH = "/health"
+PUBLIC = (HEALTH, "/web")
+# what ends names that no stranger can have: RFC 6761, RFC 6762, RFC 8375, and ICANN's for private use
+OWN_ENDS = (".localhost", ".local", ".internal", ".home.arpa", ".test")
 READING = frozenset({"GET", "HEAD", "OPTIONS"})
 # below each path: the scope to read, and the scope to do anything else; the longest path that fits counts
 SCOPES_BY_PATH: dict[str, tuple[KeyScope | None, KeyScope | None]] = {
@@ -42,22 +48,31 @@ SCOPES_OF_READING: dict[tuple[str, str], KeyScope] = {("POST", "/cameras/preview
 class Authenticate:
     """Puts a ``Principal`` into the request's state: the key's owner, or ``ANYBODY`` where no key is asked for.
 
-    Raises ``Unauthorized``, ``Forbidden`` and ``QuotaExceeded``; without keys ``CrossOrigin``.
+    Raises ``Unauthorized``, ``Forbidden`` and ``QuotaExceeded``; without keys ``CrossOrigin``, and ``UnknownHost`` for
+    another name than ``hosts`` and those that no stranger can have.
     """
 
-    def __init__(self, app: ASGIApp, *, is_on: bool, requests_per_minute: int) -> None:
+    def __init__(self, app: ASGIApp, *, is_on: bool, requests_per_minute: int, hosts: Collection[str] = ()) -> None:
         self._app = app
         self._is_on = is_on
+        self._hosts = frozenset(hosts)
         self._quota = RateLimitItemPerMinute(requests_per_minute) if requests_per_minute else None
         self._limiter = MovingWindowRateLimiter(MemoryStorage())
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "http":
-            if not self._is_on and scope["method"] not in READING and is_from_another_site(Headers(scope=scope)):
-                raise CrossOrigin("A page of another site asked for this; only the service's own page may.")
+            if not self._is_on:
+                self._refuse_strangers(scope)
             state = scope.setdefault("state", {})
             state["principal"] = await self._principal(scope) if self._is_on else ANYBODY
         await self._app(scope, receive, send)
+
+    def _refuse_strangers(self, scope: Scope) -> None:
+        headers = Headers(scope=scope)
+        if not _is_below(scope["path"], HEALTH) and not is_own_name(headers.get("host", ""), self._hosts):
+            raise UnknownHost("The service is not known by this name: add it to CAMIND_HOSTS, or serve with API keys.")
+        if scope["method"] not in READING and is_from_another_site(headers):
+            raise CrossOrigin("A page of another site asked for this; only the service's own page may.")
 
     async def _principal(self, scope: Scope) -> Principal:
         if is_public(scope["path"]):
@@ -91,6 +106,24 @@ def is_from_another_site(headers: Headers) -> bool:
     if site is not None:
         return site in ("cross-site", "same-site")
     return origin is not None and urlsplit(origin).netloc != headers.get("host")
+
+
+def is_own_name(host: str, hosts: Collection[str] = ()) -> bool:
+    """Whether a ``Host`` header has one of these names, or one that no stranger can bind to this machine.
+
+    That is an address, a name of one label, or one below a domain that the DNS at large does not have.
+    """
+    try:
+        name = (urlsplit(f"//{host}").hostname or "").removesuffix(".")
+    except ValueError:
+        return False
+    if "." not in name or name.endswith(OWN_ENDS) or name in hosts:
+        return True
+    try:
+        ip_address(name)
+    except ValueError:
+        return False
+    return True
 
 
 def is_public(path: str) -> bool:

@@ -106,7 +106,12 @@ def _add_middleware(app: FastAPI, settings: Settings) -> None:
             CALIBRATE_PATH: BodyLimits(settings.max_calibration_bytes, settings.calibration_receive_deadline_s),
         },
     )
-    app.add_middleware(Authenticate, is_on=settings.wants_keys, requests_per_minute=settings.key_requests_per_minute)
+    app.add_middleware(
+        Authenticate,
+        is_on=settings.wants_keys,
+        requests_per_minute=settings.key_requests_per_minute,
+        hosts=settings.known_hosts,
+    )
     app.add_middleware(AnswerHead)
     app.add_middleware(ObserveRequests, metrics=app.state.metrics, tracing=app.state.tracing)
 

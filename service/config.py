@@ -62,6 +62,14 @@ class Settings(BaseSettings):
         int, Field(ge=0, le=1_000_000, description="Requests of one API key in a minute; 0: no quota")
     ] = 600
 
+    hosts: Annotated[
+        str,
+        Field(
+            pattern=r"^([\w.-]+(, ?[\w.-]+)*)?$",
+            description="Names, by commas, by which the service may be asked without API keys: a proxy's",
+        ),
+    ] = ""
+
     workers: Annotated[int, Field(ge=0, le=64, description="Images worked on at a time; 0: cores / 2")] = 0
     intra_op_threads: Annotated[int, Field(ge=0, le=64, description="Threads per image; 0: cores / workers")] = 0
     queue_size: Annotated[int, Field(ge=0, le=1000, description="Images that may wait for a worker")] = 16
@@ -160,6 +168,11 @@ class Settings(BaseSettings):
     def wants_keys(self) -> bool:
         """Whether a request needs an API key."""
         return self.api_keys == "on" or (self.api_keys == "auto" and not self.is_loopback)
+
+    @property
+    def known_hosts(self) -> frozenset[str]:
+        """``hosts``, one by one."""
+        return frozenset(name.strip().lower() for name in self.hosts.split(",") if name)
 
     @property
     def is_loopback(self) -> bool:

@@ -15,6 +15,7 @@ CamindError
 ├── PreconditionFailed (412)   If-Match names another revision
 ├── TooLarge (413)             too many bytes or pixels
 ├── UnsupportedKind (415)      a media type or file kind that is not listed
+├── UnknownHost (421)          asked for by a name that may be a stranger's
 ├── NotAcceptable (406)        no representation fits Accept
 ├── QuotaExceeded (429)        the API key asked too often
 ├── Busy (503)                 the queue is full, or the deadline passed
@@ -103,6 +104,12 @@ class CrossOrigin(CamindError):
     status = 403
     code = "cross-origin"
     title = "Asked by another site's page"
+
+
+class UnknownHost(CamindError):
+    status = 421
+    code = "unknown-host"
+    title = "Asked for by an unknown name"
 
 
 class NotFound(CamindError):

@@ -95,6 +95,48 @@ def test_without_keys_another_site_s_page_changes_nothing(
             assert made.status_code == 201
 
 
+@pytest.mark.parametrize(
+    ("host", "is_known"),
+    [
+        ("localhost:8000", True),
+        ("127.0.0.1:8000", True),
+        ("[::1]:8000", True),
+        ("10.1.2.3", True),
+        ("camind:8000", True),
+        ("rig.local", True),
+        ("camind.lab.svc.cluster.local:8000", True),
+        ("camind.example.org", True),
+        ("CAMIND.example.org.:443", True),
+        ("stranger.example:8000", False),
+        ("camind.example.org.stranger.example", False),
+        ("localhost.stranger.example", False),
+        ("127.0.0.1.stranger.example:8000", False),
+        ("127.0.0.1@stranger.example", False),
+        ("stranger.example#.local", False),
+        ("[stranger.example", False),
+    ],
+)
+def test_without_keys_a_stranger_s_name_for_this_machine_opens_nothing(
+    settings: Settings, host: str, is_known: bool
+) -> None:
+    told = {"api_keys": "off", "hosts": "camind.example.org, depth.example.org"}
+    app = create_app(settings.model_copy(update=told), FakeCalibration())
+    with TestClient(app) as client:
+        asked = {"Host": host, "Origin": f"http://{host}", "Sec-Fetch-Site": "same-origin"}
+        answers = [client.get("/cameras", headers=asked), client.post("/cameras", json=CAMERA, headers=asked)]
+        if is_known:
+            assert [answer.status_code for answer in answers] == [200, 201]
+        else:
+            for answer in answers:
+                refused(answer, 421, "unknown-host")
+        assert client.get("/health/ready", headers=asked).status_code == 200
+
+
+def test_with_a_key_any_name_will_do(client: TestClient, keys: Keys) -> None:
+    asked = {"Host": "stranger.example"} | bearer(keys, "lab", "cameras:read")
+    assert client.get("/cameras", headers=asked).status_code == 200
+
+
 def test_every_path_but_health_and_the_page_asks_for_a_key(app: FastAPI, client: TestClient) -> None:
     asked = {(method, path.format(name="x", id="0" * 32)) for method, path, _ in operations(app)}
     others = {("GET", path) for path in ("/docs", "/openapi.json", "/webx", NOWHERE)}

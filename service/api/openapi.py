@@ -10,14 +10,14 @@ from fastapi.openapi.utils import get_openapi
 
 from service.access import is_public, needed_scope
 from service.api.problems import Problem, responses
-from service.errors import CrossOrigin, Forbidden, QuotaExceeded, ReceiveTimeout, TooLarge, Unauthorized
+from service.errors import CrossOrigin, Forbidden, QuotaExceeded, ReceiveTimeout, TooLarge, Unauthorized, UnknownHost
 
 # words that YAML reads as truth values or nothing
 YAML_WORDS = frozenset({"null", "true", "false", "yes", "no", "on", "off", "y", "n"})
 REF = "#/components/schemas/{model}"
 # what the limits in front of the routes answer
 BODY_ERRORS = (ReceiveTimeout, TooLarge)
-KEY_ERRORS = (Unauthorized, QuotaExceeded)
+KEY_ERRORS = (Unauthorized, QuotaExceeded, UnknownHost)
 API_KEY = "apiKey"
 SECURITY = {
     "type": "http",

@@ -90,6 +90,7 @@ EXAMPLES: dict[str, tuple[str, tuple[FieldProblem, ...]]] = {
     ),
     "unauthorized": ("This API key is unknown, revoked or expired.", ()),
     "forbidden": ("This API key lacks the scope depth.", ()),
+    "unknown-host": ("The service is not known by this name: add it to CAMIND_HOSTS, or serve with API keys.", ()),
     "cross-origin": ("A page of another site asked for this; only the service's own page may.", ()),
     "quota-exceeded": ("This API key has had its 600 requests of this minute.", ()),
     "not-found": ("There is no camera 'd200'.", ()),
