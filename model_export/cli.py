@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -183,7 +184,8 @@ def export(
         task = progress.add_task("float32", total=5)
         manifest = export_checkpoint(checkpoint, pictures, out, name)
         progress.update(task, advance=1, description=INT8)
-        export_checkpoint(checkpoint, pictures, out / INT8, f"{manifest.name}-{INT8}", quantised_graphs)
+        in_int8 = partial(quantised_graphs, floating=out)
+        export_checkpoint(checkpoint, pictures, out / INT8, f"{manifest.name}-{INT8}", in_int8)
         progress.update(task, advance=1, description="held-out scenes")
         cases = unseen_cases()
         progress.advance(task)

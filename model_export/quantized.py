@@ -21,11 +21,11 @@ from onnxruntime.quantization import QuantFormat, QuantType, quantize_static
 from onnxruntime.quantization.shape_inference import quant_pre_process
 
 from model_export.config import SceneConfig
-from model_export.export import export_graphs, feature_names, finish
+from model_export.export import feature_names, finish
 from model_export.networks import Pair
 from model_export.scenes import draw_sample
 from model_export.verify import CAMERA, through_torch
-from service.inference.artifact import GraphFile, Graphs, TensorSpec, sha256_of
+from service.inference.artifact import GraphFile, Graphs, TensorSpec, load_model_folder, sha256_of
 
 SCENES = 48
 FIRST_SEED = 2**41  # neither a training's nor a held-out scene's
@@ -48,18 +48,19 @@ class _Feeds:
         return next(self._feeds, None)
 
 
-def quantised_graphs(pair: Pair, folder: Path) -> Graphs:
-    """Write both graphs in int8, their ranges taken from generated scenes; what the manifest says of all.
+def quantised_graphs(pair: Pair, folder: Path, floating: Path) -> Graphs:
+    """Write in int8 both graphs of the pair's model folder, ``floating``; what the manifest says of all.
 
-    The layout's own graph, which large pictures alone need, and once, stays as it is.
+    Their ranges are those of generated scenes. The layout's own graph, which large pictures alone need, and once, stays
+    as it is.
     """
-    with tempfile.TemporaryDirectory() as scratch:
-        graphs = export_graphs(pair, Path(scratch))
-        seen, asked = zip(*_scene_feeds(pair, graphs.feature_names), strict=True)
-        blur = _quantised(Path(scratch, graphs.blur.file), list(seen), FIRST_OF_BLUR)
-        depth = _quantised(Path(scratch, graphs.depth.file), list(asked), FIRST_OF_DEPTH)
-        if graphs.layout:
-            shutil.copy(Path(scratch, graphs.layout.file), folder)
+    exported = load_model_folder(floating)
+    graphs = exported.manifest.graphs
+    seen, asked = zip(*_scene_feeds(pair, graphs.feature_names), strict=True)
+    blur = _quantised(exported.blur_graph, list(seen), FIRST_OF_BLUR)
+    depth = _quantised(exported.depth_graph, list(asked), FIRST_OF_DEPTH)
+    if exported.layout_graph:
+        shutil.copy(exported.layout_graph, folder)
     for model in (blur, depth):
         _answer_by_cell(model)
     if graphs.feature_names == (FEATURES,):
@@ -80,26 +81,27 @@ def _scene_feeds(pair: Pair, feature_names: tuple[str, ...]) -> Iterator[tuple[F
 
 def _quantised(path: Path, feeds: list[Feeds], first: str) -> onnx.ModelProto:
     """A graph in int8 from that layer up to the last convolution, which is not."""
-    prepared = path.with_name(f"prepared-{path.name}")
-    quant_pre_process(path, prepared, skip_symbolic_shape=True)
-    floating = onnx.load(prepared)
-    level = logging.root.level
-    logging.root.setLevel(logging.ERROR)  # it warns of what has been done
-    try:
-        quantize_static(
-            prepared,
-            path,
-            _Feeds(feeds),
-            quant_format=QuantFormat.QDQ,
-            activation_type=QuantType.QUInt8,
-            weight_type=QuantType.QInt8,
-            per_channel=True,
-            reduce_range=True,
-            nodes_to_quantize=_from_first_to_last(floating, first),
-        )
-    finally:
-        logging.root.setLevel(level)
-    model = onnx.load(path)
+    with tempfile.TemporaryDirectory() as scratch:
+        prepared, quantised = Path(scratch, "prepared.onnx"), Path(scratch, "quantised.onnx")
+        quant_pre_process(path, prepared, skip_symbolic_shape=True)
+        floating = onnx.load(prepared)
+        level = logging.root.level
+        logging.root.setLevel(logging.ERROR)  # it warns of what has been done
+        try:
+            quantize_static(
+                prepared,
+                quantised,
+                _Feeds(feeds),
+                quant_format=QuantFormat.QDQ,
+                activation_type=QuantType.QUInt8,
+                weight_type=QuantType.QInt8,
+                per_channel=True,
+                reduce_range=True,
+                nodes_to_quantize=_from_first_to_last(floating, first),
+            )
+        finally:
+            logging.root.setLevel(level)
+        model = onnx.load(quantised)
     _take_back_shifts(model, floating, feeds)
     return model
 

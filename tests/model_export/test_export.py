@@ -1,5 +1,6 @@
 """Export: the files answer as torch does, and the folder vouches for them."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -36,20 +37,35 @@ def untrained(kind: Kind) -> Pair:
     return pair
 
 
-@pytest.fixture(scope="module")
-def in_int8(tmp_path_factory: pytest.TempPathFactory) -> tuple[Pair, Path]:
-    pair, folder = untrained("compact"), tmp_path_factory.mktemp("int8")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(quantized, "SCENES", CALIBRATED_ON)
-        export_pair(pair, TrainConfig(), 0, folder, write_graphs=quantized.quantised_graphs)
+def exported_untrained(kind: Kind, folder: Path) -> tuple[Pair, Path]:
+    pair = untrained(kind)
+    export_pair(pair, TrainConfig(kind=kind), 0, folder, sources="- brick: CC0")
     return pair, folder
 
 
+@pytest.fixture(scope="module")
+def compact(tmp_path_factory: pytest.TempPathFactory) -> tuple[Pair, Path]:
+    return exported_untrained("compact", tmp_path_factory.mktemp("compact"))
+
+
+@pytest.fixture(scope="module")
+def paper(tmp_path_factory: pytest.TempPathFactory) -> tuple[Pair, Path]:
+    return exported_untrained("paper", tmp_path_factory.mktemp("paper"))
+
+
 @pytest.fixture(scope="module", params=KINDS)
-def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pair, Path]:
-    pair = untrained(request.param)
-    folder = tmp_path_factory.mktemp(request.param)
-    export_pair(pair, TrainConfig(kind=request.param), 0, folder, sources="- brick: CC0")
+def exported(request: pytest.FixtureRequest) -> tuple[Pair, Path]:
+    found: tuple[Pair, Path] = request.getfixturevalue(request.param)
+    return found
+
+
+@pytest.fixture(scope="module")
+def in_int8(compact: tuple[Pair, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[Pair, Path]:
+    (pair, floating), folder = compact, tmp_path_factory.mktemp("int8")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(quantized, "SCENES", CALIBRATED_ON)
+        in_int8 = partial(quantized.quantised_graphs, floating=floating)
+        export_pair(pair, TrainConfig(), 0, folder, write_graphs=in_int8)
     return pair, folder
 
 
