@@ -41,6 +41,7 @@ TEXTURED_SHARE = 0.6
 SIDES: dict[int, Side] = {-1: "near", 0: "auto", 1: "far"}
 FIXED = "fixed"
 FIXED_SCENES = 6
+MISFOCUSED = ("focus -10%", "focus +10%")
 PROCEDURAL_SIDES = {"near": -1, "far": 1, "mixed": 0}
 
 Map = NDArray[np.float32]
@@ -258,7 +259,8 @@ def trials(data: Path, quick: bool) -> list[Trial]:
         found += _indoor_trials(folder, quick)
     if (data / "d200").is_dir():
         source = partial(d200_cases, data / "d200", 2 * many)
-        found.append(replace(_trial("d200", source, "right side", "ring from the sensor"), oracle=True))
+        further = ("right side", "ring from the sensor", *MISFOCUSED)
+        found.append(replace(_trial("d200", source, *further), oracle=True))
     return found
 
 
@@ -276,7 +278,8 @@ def _indoor_trials(folder: Path, quick: bool) -> list[Trial]:
     found = []
     for k_cam_px in (REFERENCE.k_cam_px,) if quick else UNSEEN_K_CAM_PX:
         camera = replace(REFERENCE, k_cam_px=k_cam_px)
-        further = ("estimated k_cam", "no k_cam", *(("k_cam -10%", "k_cam +10%") if camera == REFERENCE else ()))
+        misled = ("k_cam -10%", "k_cam +10%", *MISFOCUSED) if camera == REFERENCE else ()
+        further = ("estimated k_cam", "no k_cam", *misled)
         count = many if camera == REFERENCE else several
         found.append(_trial(f"{folder.name} k_cam {k_cam_px:g}", by(camera, count), *further))
     found.append(_trial(f"{folder.name} in focus", partial(sharp_cases, folder, several)))

@@ -36,6 +36,11 @@ def _misled(factor: float, camera: Camera) -> Camera:
     return replace(camera, k_cam_px=factor * camera.k_cam_px)
 
 
+def _misfocused(factor: float, camera: Camera) -> Camera:
+    """The camera said to be focused so many times as far, its k_cam that of its lens there."""
+    return camera.focused_at(factor * camera.focus_distance_m)
+
+
 def _counted_from_lens(camera: Camera) -> Camera:
     """The camera whose focus distance is a ring's, which counts it from the sensor."""
     return camera.focused_at(thin_lens.focus_from_lens(camera.focus_distance_m, camera.focal_length_m or 0.0))
@@ -47,6 +52,8 @@ MODES: dict[str, Callable[[Camera], Camera]] = {
     "no k_cam": lambda camera: replace(camera, k_cam_px=UNKNOWN_K_CAM_PX),
     "k_cam -10%": partial(_misled, 0.9),
     "k_cam +10%": partial(_misled, 1.1),
+    "focus -10%": partial(_misfocused, 0.9),
+    "focus +10%": partial(_misfocused, 1.1),
     "ring from the sensor": _counted_from_lens,
 }
 # what no user has: they tell how much of an error is the camera's, and how much the side's

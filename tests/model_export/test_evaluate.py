@@ -98,6 +98,15 @@ def test_a_wrong_k_cam_is_told_to_the_estimator(oracle: Examiner) -> None:
     assert outcome.median_error == pytest.approx((1 + x) / (1 + x / 1.1) - 1, rel=1e-3)
 
 
+@pytest.mark.parametrize(("mode", "factor"), [("focus -10%", 0.9), ("focus +10%", 1.1)])
+def test_a_wrong_focus_distance_is_told_to_the_estimator(oracle: Examiner, mode: str, factor: float) -> None:
+    """k_cam follows it, so x is read so many times as large."""
+    right = case(1.0)
+    x = CAMERA.focus_distance_m / right.truth_m[0, -1] - 1
+    outcome, _ = oracle.answer(right, mode)
+    assert outcome.median_error == pytest.approx(abs(factor * (1 + x) / (1 + factor * x) - 1), rel=1e-3)
+
+
 def test_a_camera_known_by_its_sheets_alone_is_nearly_the_true_one() -> None:
     found = calibrated(REFERENCE)
     assert 0 < abs(found.k_cam_px / REFERENCE.k_cam_px - 1) < 0.03
