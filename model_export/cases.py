@@ -41,6 +41,7 @@ TEXTURED_SHARE = 0.6
 SIDES: dict[int, Side] = {-1: "near", 0: "auto", 1: "far"}
 FIXED = "fixed"
 FIXED_SCENES = 6
+ORACLE_FACTORS = (0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.4, 1.6)
 MISFOCUSED = ("focus -10%", "focus +10%")
 PROCEDURAL_SIDES = {"near": -1, "far": 1, "mixed": 0}
 
@@ -229,13 +230,18 @@ def _spread(folder: Path, count: int) -> Iterator[Photo]:
 class Trial:
     """A named set, and the modes (see ``evaluate.MODES``) in which its pictures are answered.
 
-    With ``oracle`` they are also answered with the one factor on all k_cam that the truth likes best.
+    They are also answered with ``factors`` on all k_cam, of which the one that the truth likes best is kept.
     """
 
     name: str
     cases: CaseSource
     modes: tuple[str, ...] = ("gt",)
-    oracle: bool = False
+    factors: tuple[float, ...] = ()
+
+    @property
+    def answers(self) -> int:
+        """How often each picture is answered."""
+        return len(self.modes) + len(self.factors)
 
 
 def _enough(source: CaseSource) -> Iterator[Case]:
@@ -260,7 +266,7 @@ def trials(data: Path, quick: bool) -> list[Trial]:
     if (data / "d200").is_dir():
         source = partial(d200_cases, data / "d200", 2 * many)
         further = ("right side", "ring from the sensor", *MISFOCUSED)
-        found.append(replace(_trial("d200", source, *further), oracle=True))
+        found.append(replace(_trial("d200", source, *further), factors=ORACLE_FACTORS))
     return found
 
 

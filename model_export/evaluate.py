@@ -58,7 +58,6 @@ MODES: dict[str, Callable[[Camera], Camera]] = {
 }
 # what no user has: they tell how much of an error is the camera's, and how much the side's
 RIGHT_SIDE, ORACLE_K_CAM = "right side", "oracle k_cam"
-ORACLE_FACTORS = (0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.4, 1.6)
 BLUR_RANGES_PX = (
     *((0.0, 0.5), (0.5, 1.0), (1.0, 2.0), (2.0, 4.0), (4.0, 8.0), (8.0, 16.0), (16.0, math.inf)),
     *((0.6, 1.0), (1.0, 8.0), (0.0, math.inf)),
@@ -465,7 +464,7 @@ class _Examined:
             outcome, example = examiner.answer(case, mode)
             self.outcomes.setdefault(mode, []).append(outcome)
             self.example = self.example or example
-        for factor in ORACLE_FACTORS if trial.oracle else ():
+        for factor in trial.factors:
             self.searched.setdefault(factor, []).append(examiner.told(case, _misled(factor, case.camera))[0])
 
     def by_mode(self) -> dict[str, list[Outcome]]:
@@ -496,10 +495,13 @@ def evaluate(
 
     ``on_progress`` hears, from any thread, of every picture, and how many sets that finishes.
     """
+    # what is answered most often first, lest a core wait for it in the end
+    ordered = sorted(trials, key=lambda trial: trial.answers, reverse=True)
     # renderings side by side, rather than each in pieces on every core
     with torch_threads(1), ThreadPoolExecutor(SETS_AT_ONCE) as pool:
-        done = list(pool.map(partial(_examined, models, on_progress), trials))
-    by_model = zip(models, zip(*done, strict=True), strict=True)
+        examined = pool.map(partial(_examined, models, on_progress), ordered)
+        done = dict(zip((trial.name for trial in ordered), examined, strict=True))
+    by_model = zip(models, zip(*(done[trial.name] for trial in trials), strict=True), strict=True)
     return [_reported(load_model_folder(model).manifest.name, sets) for model, sets in by_model]
 
 

@@ -259,14 +259,11 @@ def _slices(defocus_px: NDArray[np.float32], per_level: float = 2.0) -> NDArray[
 
 def _filled(image: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np.float32]:
     """The image with every unknown pixel given the colour of the nearest known one."""
-    _, labels = cv2.distanceTransformWithLabels(
-        (~known).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    nearest = np.zeros(int(labels.max()) + 1, np.intp)
-    nearest[labels[known]] = np.flatnonzero(known)
-    out = image.copy()
-    out[~known] = image.reshape(-1, 3)[nearest[labels[~known]]]
-    return out
+    _, told = cv2.distanceTransformWithLabels((~known).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    labels, own = np.asarray(told, np.int32).ravel(), np.flatnonzero(known)
+    nearest = np.zeros(len(own) + 1, np.intp)
+    nearest[labels[own]] = own
+    return image.reshape(-1, 3).take(nearest.take(labels), axis=0).reshape(image.shape)
 
 
 def _slice(linear: NDArray[np.float32], index: NDArray[np.int32], number: int) -> tuple[Tensor, Tensor]:

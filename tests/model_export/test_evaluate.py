@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from model_export.calibrated import calibrated
 from model_export.cases import (
+    ORACLE_FACTORS,
     REFERENCE,
     Case,
     Trial,
@@ -135,7 +136,7 @@ def test_the_right_side_is_that_of_each_pixel(oracle: Examiner) -> None:
 def test_the_oracle_finds_the_one_factor_that_all_pictures_like_best(tiny_model_dir: Path) -> None:
     wrong = replace(CAMERA, k_cam_px=CAMERA.k_cam_px / 1.25)
     pictures = [replace(case(1.0), camera=wrong) for _ in range(2)]
-    (report,) = evaluate([tiny_model_dir], [Trial("grey", lambda: iter(pictures), oracle=True)])
+    (report,) = evaluate([tiny_model_dir], [Trial("grey", lambda: iter(pictures), factors=ORACLE_FACTORS)])
     assert report.summary("grey").mean.abs_rel > 0.05
     assert report.summary("grey", "oracle k_cam, x 1.25").mean.abs_rel == pytest.approx(0, abs=1e-3)
 
