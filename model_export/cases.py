@@ -17,6 +17,7 @@ from model_export.datasets.photos import Photo, filled, load_photos
 from model_export.render import refocus
 from model_export.scenes import draw_sample, draw_shot, true_blur_px
 from model_export.train import HELD_OUT_SEED
+from service.inference.known import KnownDepth
 from service.inference.pair import Side
 from service.optics import thin_lens
 from service.optics.camera import Camera, Intrinsics, Lens
@@ -43,6 +44,8 @@ FIXED = "fixed"
 FIXED_SCENES = 6
 ORACLE_FACTORS = (0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.4, 1.6)
 MISFOCUSED = ("focus -10%", "focus +10%")
+KNOWN_DEPTHS = ", known depths"  # after another mode's name: the focus distance is then fitted to these
+KNOWN_RANKS = (1 / 6, 3 / 6, 5 / 6)
 PROCEDURAL_SIDES = {"near": -1, "far": 1, "mixed": 0}
 
 Map = NDArray[np.float32]
@@ -61,6 +64,14 @@ class Case:
     camera: Camera
     side: Side
     blur_px: Map | None = None
+
+    @property
+    def known_depths(self) -> list[KnownDepth]:
+        """What a user with a tape would tell: the depth of a near, a middle and a far pixel."""
+        rows, columns = np.nonzero(np.isfinite(self.truth_m))
+        depth_m = self.truth_m[rows, columns]
+        chosen = np.argsort(depth_m, kind="stable")[[int(rank * depth_m.size) for rank in KNOWN_RANKS]]
+        return [KnownDepth(columns[place], rows[place], float(depth_m[place])) for place in chosen]
 
 
 CaseSource = Callable[[], Iterator[Case]]
@@ -265,7 +276,7 @@ def trials(data: Path, quick: bool) -> list[Trial]:
         found += _indoor_trials(folder, quick)
     if (data / "d200").is_dir():
         source = partial(d200_cases, data / "d200", 2 * many)
-        further = ("right side", "ring from the sensor", *MISFOCUSED)
+        further = ("right side", "ring from the sensor", *MISFOCUSED, "gt" + KNOWN_DEPTHS, MISFOCUSED[1] + KNOWN_DEPTHS)
         found.append(replace(_trial("d200", source, *further), factors=ORACLE_FACTORS))
     return found
 
@@ -281,10 +292,11 @@ def _indoor_trials(folder: Path, quick: bool) -> list[Trial]:
     def by(camera: Camera, count: int, side: Side = "near") -> CaseSource:
         return partial(refocused_cases, folder, count, camera, side)
 
+    misfocused = (*MISFOCUSED, MISFOCUSED[1] + KNOWN_DEPTHS)
     found = []
     for k_cam_px in (REFERENCE.k_cam_px,) if quick else UNSEEN_K_CAM_PX:
         camera = replace(REFERENCE, k_cam_px=k_cam_px)
-        misled = ("k_cam -10%", "k_cam +10%", *MISFOCUSED) if camera == REFERENCE else ()
+        misled = ("k_cam -10%", "k_cam +10%", *misfocused) if camera == REFERENCE else ()
         further = ("estimated k_cam", "no k_cam", *misled)
         count = many if camera == REFERENCE else several
         found.append(_trial(f"{folder.name} k_cam {k_cam_px:g}", by(camera, count), *further))
@@ -302,5 +314,5 @@ def _indoor_trials(folder: Path, quick: bool) -> list[Trial]:
         found += [_trial(f"{folder.name} k_cam {k_cam_px:g} of {large}", enlarged)]
     for focus_m in FOCUS_DISTANCES_M:
         camera = replace(REFERENCE, focus_distance_m=focus_m)
-        found.append(_trial(f"{folder.name} focus {focus_m:g} m", by(camera, few, "auto")))
+        found.append(_trial(f"{folder.name} focus {focus_m:g} m", by(camera, few, "auto"), *misfocused))
     return found

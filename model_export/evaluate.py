@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_export.calibrated import calibrated
-from model_export.cases import UNSEEN_K_CAM_PX, Case, Trial
+from model_export.cases import KNOWN_DEPTHS, UNSEEN_K_CAM_PX, Case, Trial
 from model_export.cores import torch_threads
 from model_export.metrics import Scores, best_constant, completed, mean_scores, pooled_scores, score
 from service.inference.artifact import ModelFolder, load_model_folder
@@ -23,6 +23,7 @@ from service.inference.cancellation import Cancellation
 from service.inference.depth_map import DepthMap, Layers
 from service.inference.estimator import Estimator
 from service.inference.hypotheses import SIGMA_OF_LAPLACE
+from service.inference.known import refocused
 from service.inference.pair import GraphPair, RawMaps
 from service.optics import thin_lens
 from service.optics.camera import Camera
@@ -320,7 +321,10 @@ class Examiner:
         """Run a case through the estimator, with the camera as the mode tells it, and score the answer."""
         if mode == RIGHT_SIDE:
             return self._scored(case, self._rightly_sided(case))
-        return self.told(case, MODES[mode](case.camera), blur=mode == "gt")
+        camera = MODES[mode.removesuffix(KNOWN_DEPTHS)](case.camera)
+        if mode.endswith(KNOWN_DEPTHS):
+            camera, _ = refocused(self._estimator, case.image, camera, case.known_depths)
+        return self.told(case, camera, blur=mode == "gt")
 
     def told(self, case: Case, camera: Camera, *, blur: bool = False) -> tuple[Outcome, Example]:
         """Score the answer to a case that is said to be by some camera, and its lambda where asked to."""
@@ -509,7 +513,7 @@ def _reported(model: str, done: Sequence[_Examined]) -> Report:
     outcomes = {(e.name, mode): scored for e in done for mode, scored in e.by_mode().items()}
     examples = {e.name: e.example for e in done if e.example is not None}
     for k_cam_px in UNSEEN_K_CAM_PX:
-        for mode in MODES:
+        for mode in dict.fromkeys(mode for _, mode in outcomes):
             both = [outcomes.get((f"{folder} k_cam {k_cam_px:g}", mode), []) for folder in ("rgbd", "tabletop")]
             if all(both):
                 outcomes[f"indoor k_cam {k_cam_px:g}", mode] = [*both[0], *both[1]]

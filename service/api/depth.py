@@ -29,7 +29,8 @@ from service.inference.depth_map import DepthMap
 from service.inference.encode import ENCODERS, MEDIA_TYPES, Encoded, pixel_at, read_point, spread_of
 from service.inference.estimator import Estimator
 from service.inference.frame import camera_of
-from service.inference.images import ImageLimits, read_photograph
+from service.inference.images import ImageLimits, Photograph, read_photograph
+from service.inference.known import refocused
 from service.inference.pair import Stopwatch
 from service.inference.part import Part
 from service.optics.camera import Camera
@@ -56,9 +57,10 @@ class Order:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The encoded map, everything worth a warning, and the time of each stage in milliseconds."""
+    """The encoded map, the camera it is by, everything worth a warning, and the time of each stage in milliseconds."""
 
     encoded: Encoded
+    camera: Camera
     warnings: tuple[str, ...]
     timings_ms: Mapping[str, float]
 
@@ -84,6 +86,7 @@ router = APIRouter(tags=["depth"])
                     "Camind-Camera": "The camera's name",
                     "Camind-Camera-Revision": "The camera's revision that was used",
                     "Camind-Model": "The model's name",
+                    "Camind-Focus-Distance-M": "The focus distance used, in metres",
                     "Camind-Depth-Scale-M": "Metres per unit of the map: 0.001 for png, else 1",
                     "Camind-Warnings": "What to know about this answer, separated by semicolons",
                     "Server-Timing": f"Milliseconds of {', '.join(STAGES)}",
@@ -134,6 +137,7 @@ async def estimate_depth(
             "Camind-Camera": record.name,
             "Camind-Camera-Revision": str(record.revision),
             "Camind-Model": estimator.manifest.name,
+            "Camind-Focus-Distance-M": f"{answer.camera.focus_distance_m:.6g}",
             "Camind-Depth-Scale-M": f"{answer.encoded.depth_scale_m:g}",
             "Camind-Warnings": _header_safe("; ".join(answer.warnings)),
             "Server-Timing": ", ".join(f"{stage};dur={timings_ms[stage]:.1f}" for stage in STAGES),
@@ -152,15 +156,34 @@ def fulfil(cancellation: Cancellation, order: Order, estimator: Estimator) -> An
     part.require_within(photograph.width_px, photograph.height_px)
     for u, v in order.query.points:
         pixel_at(u, v, part)
+    camera, fitted = _fitted(cancellation, order, estimator, photograph, camera, stopwatch)
     depth_map = estimator.estimate(photograph.rgb, camera, order.query.side, cancellation, order.query.part)
     stopwatch.add(depth_map.timings_ms)
-    warnings = (*order.warnings, *photograph.warnings, *resized, *depth_map.warnings)
+    warnings = (*order.warnings, *photograph.warnings, *resized, *fitted, *depth_map.warnings)
     with stopwatch.stage("encode"):
         if order.format == JSON:
             encoded = _encode_json(depth_map, order, part, estimator.manifest.name, warnings)
         else:
             encoded = ENCODERS[order.format](depth_map, part.of(photograph.rgb))
-    return Answer(encoded, (*warnings, *encoded.warnings), stopwatch.elapsed_ms)
+    return Answer(encoded, camera, (*warnings, *encoded.warnings), stopwatch.elapsed_ms)
+
+
+def _fitted(
+    cancellation: Cancellation,
+    order: Order,
+    estimator: Estimator,
+    photograph: Photograph,
+    camera: Camera,
+    stopwatch: Stopwatch,
+) -> tuple[Camera, tuple[str, ...]]:
+    """The camera focused where known depths say it was, with what is to be said of that; as it is where none are."""
+    known = order.query.known_depths
+    if not known:
+        return camera, ()
+    whole = Part(0, 0, photograph.width_px, photograph.height_px)
+    for point in known:
+        pixel_at(point.u, point.v, whole, "known")
+    return refocused(estimator, photograph.rgb, camera, known, cancellation, stopwatch)
 
 
 def _encode_json(depth_map: DepthMap, order: Order, part: Part, model: str, warnings: tuple[str, ...]) -> Encoded:

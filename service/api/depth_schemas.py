@@ -5,12 +5,15 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from service.inference.known import KnownDepth
 from service.inference.pair import Side
 from service.inference.part import Part
 
 ROI = r"^\d{1,6},\d{1,6},\d{1,6},\d{1,6}$"
 MAX_POINTS = 1000
+MAX_KNOWN = 100
 POINT = r"^-?\d{1,6}(\.\d{1,6})?,-?\d{1,6}(\.\d{1,6})?$"
+KNOWN = POINT[:-1] + r",([1-9]\d{0,4}(\.\d{1,6})?|0\.0{0,2}[1-9]\d{0,5})$"
 
 
 def _require_point(value: str) -> str:
@@ -19,7 +22,15 @@ def _require_point(value: str) -> str:
     return value
 
 
+def _require_known(value: str) -> str:
+    if not re.fullmatch(KNOWN, value):
+        raise ValueError("a known depth is a pixel and metres from 0.001 on, u,v,depth_m: for instance 320,216,1.25")
+    return value
+
+
 Point = Annotated[str, AfterValidator(_require_point), Field(json_schema_extra={"pattern": POINT})]
+
+Known = Annotated[str, AfterValidator(_require_known), Field(json_schema_extra={"pattern": KNOWN})]
 
 
 class DepthQuery(BaseModel):
@@ -50,6 +61,19 @@ class DepthQuery(BaseModel):
         float | None,
         Field(ge=0.001, le=100_000, allow_inf_nan=False, description="This shot's focus distance, if not the camera's"),
     ] = None
+
+    known: Annotated[
+        tuple[Known, ...],
+        Field(
+            max_length=MAX_KNOWN,
+            description="Known depths u,v,depth_m, repeatable: the focus distance is fitted to them, near the one told",
+        ),
+    ] = ()
+
+    @property
+    def known_depths(self) -> list[KnownDepth]:
+        """What is known of the photograph."""
+        return [KnownDepth(*map(float, text.split(","))) for text in self.known]
 
     @property
     def points(self) -> list[tuple[float, float]]:

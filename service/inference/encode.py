@@ -209,16 +209,17 @@ def read_point(answer: DepthMap, u: float, v: float, part: Part | None = None) -
     )
 
 
-def pixel_at(u: float, v: float, part: Part) -> tuple[int, int]:
+def pixel_at(u: float, v: float, part: Part, asked_in: str = "at") -> tuple[int, int]:
     """Row and column, in a part of the photograph, of the pixel whose area holds (u, v).
 
-    Raises ``BadRequest`` outside [left - 0.5, right - 0.5) x [top - 0.5, bottom - 0.5).
+    Raises ``BadRequest``, with the option it was ``asked_in``, outside [left - 0.5, right - 0.5) x [top - 0.5,
+    bottom - 0.5).
     """
     row, column = math.floor(v + 0.5) - part.top, math.floor(u + 0.5) - part.left
     if not (0 <= row < part.height_px and 0 <= column < part.width_px):
         of = f" from ({part.left}, {part.top})" if part.left or part.top else ""
         detail = f"({u:g}, {v:g}) lies outside the upright photograph of {part.width_px}x{part.height_px} pixels{of}."
-        raise BadRequest(detail, errors=(FieldProblem("at", detail),))
+        raise BadRequest(detail, errors=(FieldProblem(asked_in, detail),))
     return row, column
 
 

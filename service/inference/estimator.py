@@ -163,9 +163,22 @@ class Estimator:
         warnings = (*self._warnings(reading, whole=part is None), *_hardness(blurrier, answer.valid_fraction))
         return replace(answer, warnings=warnings)
 
-    def read(self, rgb: NDArray[np.uint8], camera: Camera, side: Side = "auto") -> Read:
-        """What the networks answer, before it is decided what that means: for measuring them."""
-        return self._read_copies(_Request(rgb, camera, side), self._base_scale(camera))
+    def read(
+        self,
+        rgb: NDArray[np.uint8],
+        camera: Camera,
+        side: Side = "auto",
+        *,
+        cancellation: Cancellation | None = None,
+        part: Part | None = None,
+        stopwatch: Stopwatch | None = None,
+    ) -> Read:
+        """What the networks answer, of a ``part`` and its surroundings or of all, before it is decided what that means.
+
+        The stopwatch is given what it took.
+        """
+        request = _Request(rgb, camera, side, cancellation or Cancellation(), part, stopwatch or Stopwatch())
+        return self._read_copies(request, self._base_scale(camera))
 
     def _base_scale(self, camera: Camera) -> float:
         """The largest copy whose k_cam the model reads well, or a smaller one of a large picture; never enlarged."""
