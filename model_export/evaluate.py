@@ -23,7 +23,7 @@ from service.inference.cancellation import Cancellation
 from service.inference.depth_map import DepthMap, Layers
 from service.inference.estimator import Estimator
 from service.inference.hypotheses import SIGMA_OF_LAPLACE
-from service.inference.known import refocused
+from service.inference.known import KnownDepth
 from service.inference.pair import GraphPair, RawMaps
 from service.optics import thin_lens
 from service.optics.camera import Camera
@@ -321,14 +321,14 @@ class Examiner:
         """Run a case through the estimator, with the camera as the mode tells it, and score the answer."""
         if mode == RIGHT_SIDE:
             return self._scored(case, self._rightly_sided(case))
-        camera = MODES[mode.removesuffix(KNOWN_DEPTHS)](case.camera)
-        if mode.endswith(KNOWN_DEPTHS):
-            camera, _ = refocused(self._estimator, case.image, camera, case.known_depths)
-        return self.told(case, camera, blur=mode == "gt")
+        known = case.known_depths if mode.endswith(KNOWN_DEPTHS) else ()
+        return self.told(case, MODES[mode.removesuffix(KNOWN_DEPTHS)](case.camera), known, blur=mode == "gt")
 
-    def told(self, case: Case, camera: Camera, *, blur: bool = False) -> tuple[Outcome, Example]:
+    def told(
+        self, case: Case, camera: Camera, known: Sequence[KnownDepth] = (), *, blur: bool = False
+    ) -> tuple[Outcome, Example]:
         """Score the answer to a case that is said to be by some camera, and its lambda where asked to."""
-        answered = self._estimator.estimate(case.image, camera, case.side)
+        answered = self._estimator.estimate(case.image, camera, case.side, known=known)
         return self._scored(case, answered, self._blur(case) if blur else None)
 
     def _rightly_sided(self, case: Case) -> DepthMap:

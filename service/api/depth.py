@@ -29,8 +29,7 @@ from service.inference.depth_map import DepthMap
 from service.inference.encode import ENCODERS, MEDIA_TYPES, Encoded, pixel_at, read_point, spread_of
 from service.inference.estimator import Estimator
 from service.inference.frame import camera_of
-from service.inference.images import ImageLimits, Photograph, read_photograph
-from service.inference.known import refocused
+from service.inference.images import ImageLimits, read_photograph
 from service.inference.pair import Stopwatch
 from service.inference.part import Part
 from service.optics.camera import Camera
@@ -156,34 +155,18 @@ def fulfil(cancellation: Cancellation, order: Order, estimator: Estimator) -> An
     part.require_within(photograph.width_px, photograph.height_px)
     for u, v in order.query.points:
         pixel_at(u, v, part)
-    camera, fitted = _fitted(cancellation, order, estimator, photograph, camera, stopwatch)
-    depth_map = estimator.estimate(photograph.rgb, camera, order.query.side, cancellation, order.query.part)
+    known = order.query.known_depths
+    for point in known:
+        pixel_at(point.u, point.v, Part(0, 0, photograph.width_px, photograph.height_px), "known")
+    depth_map = estimator.estimate(photograph.rgb, camera, order.query.side, cancellation, order.query.part, known)
     stopwatch.add(depth_map.timings_ms)
-    warnings = (*order.warnings, *photograph.warnings, *resized, *fitted, *depth_map.warnings)
+    warnings = (*order.warnings, *photograph.warnings, *resized, *depth_map.warnings)
     with stopwatch.stage("encode"):
         if order.format == JSON:
             encoded = _encode_json(depth_map, order, part, estimator.manifest.name, warnings)
         else:
             encoded = ENCODERS[order.format](depth_map, part.of(photograph.rgb))
-    return Answer(encoded, camera, (*warnings, *encoded.warnings), stopwatch.elapsed_ms)
-
-
-def _fitted(
-    cancellation: Cancellation,
-    order: Order,
-    estimator: Estimator,
-    photograph: Photograph,
-    camera: Camera,
-    stopwatch: Stopwatch,
-) -> tuple[Camera, tuple[str, ...]]:
-    """The camera focused where known depths say it was, with what is to be said of that; as it is where none are."""
-    known = order.query.known_depths
-    if not known:
-        return camera, ()
-    whole = Part(0, 0, photograph.width_px, photograph.height_px)
-    for point in known:
-        pixel_at(point.u, point.v, whole, "known")
-    return refocused(estimator, photograph.rgb, camera, known, cancellation, stopwatch)
+    return Answer(encoded, depth_map.camera, (*warnings, *encoded.warnings), stopwatch.elapsed_ms)
 
 
 def _encode_json(depth_map: DepthMap, order: Order, part: Part, model: str, warnings: tuple[str, ...]) -> Encoded:

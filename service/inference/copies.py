@@ -1,9 +1,61 @@
-"""One set of raw maps from two copies of a photograph: what is strongly blurred is read on the smaller one."""
+"""What the networks read of a photograph's copies.
+
+It is one set of raw maps: what is strongly blurred is read on a smaller copy than all else.
+"""
+
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from service.inference.pair import RawMaps
+from service.inference.part import Part
 from service.inference.resampling import Ratio, bands, sample
+from service.optics.camera import Camera
+
+
+@dataclass(frozen=True, slots=True)
+class Read:
+    """The networks' maps of an area of the photograph, and the camera behind the copy of it that was read.
+
+    A cell of the maps is ``stride`` pixels of the copy wide and high. Copies of ``scales`` were read, each of an area
+    of its own; blur above ``most_blur_px``, in pixels of the first, is beyond the model.
+    """
+
+    maps: RawMaps
+    camera: Camera
+    area: Part
+    stride: int
+    scales: tuple[float, ...]
+    most_blur_px: float
+
+    @property
+    def ratio(self) -> Ratio:
+        """Pixels of the copy per pixel of the photograph."""
+        camera, area = self.camera, self.area
+        return Ratio.between((area.height_px, area.width_px), (camera.image_height_px, camera.image_width_px), 1)
+
+    def maps_from(self, inner: Part) -> RawMaps:
+        """The maps, as views, from where an area within this one begins."""
+        begins, ratio = inner.within(self.area), self.ratio
+        down, across = round(begins.top * ratio.rows / self.stride), round(begins.left * ratio.columns / self.stride)
+        return {name: values[down:, across:] for name, values in self.maps.items()}
+
+    def cell_of(self, u: float, v: float) -> tuple[int, int]:
+        """Row and column of the cell that holds a pixel of the photograph, which the area has."""
+        rows, columns = self.maps["blur_px"].shape
+        row = int((v - self.area.top + 0.5) * self.ratio.rows / self.stride)
+        column = int((u - self.area.left + 0.5) * self.ratio.columns / self.stride)
+        return min(row, rows - 1), min(column, columns - 1)
+
+    def places(self, rows: int, columns: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Where so many even parts of the maps have their middles, down and across, in pixels of the photograph."""
+        height, width = self.maps["blur_px"].shape
+        down = (np.arange(rows) + 0.5) * (height * self.stride / rows / self.ratio.rows) + self.area.top - 0.5
+        across = (
+            (np.arange(columns) + 0.5) * (width * self.stride / columns / self.ratio.columns) + self.area.left - 0.5
+        )
+        return down.astype(np.float32), across.astype(np.float32)
 
 
 def blend(maps: RawMaps, coarse: RawMaps, ratio: Ratio, strong_px: float) -> None:

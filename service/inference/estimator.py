@@ -1,7 +1,7 @@
 """A photograph and its camera to depth: chooses the scale, reads, decides. No answer depends on another."""
 
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from service.inference.artifact import Interval, Manifest, ModelFolder
 from service.inference.cancellation import Cancellation
-from service.inference.copies import blend
+from service.inference.copies import Read, blend
 from service.inference.depth_map import DepthMap, Reading, all_layers, decide
+from service.inference.known import Clues, KnownDepth, around
 from service.inference.later import Later
 from service.inference.pair import GraphPair, RawMaps, Side, Stopwatch
 from service.inference.part import Part
@@ -65,33 +66,6 @@ class _Request:
         return part.widened(round(SURROUNDINGS_PX / scale), round(multiple / scale), width, height)
 
 
-@dataclass(frozen=True, slots=True)
-class Read:
-    """The networks' maps of an area of the photograph, and the camera behind the copy of it that was read.
-
-    Copies of ``scales`` were read, each of an area of its own; blur above ``most_blur_px``, in pixels of the first, is
-    beyond the model.
-    """
-
-    maps: RawMaps
-    camera: Camera
-    area: Part
-    scales: tuple[float, ...]
-    most_blur_px: float
-
-    @property
-    def ratio(self) -> Ratio:
-        """Pixels of the copy per pixel of the photograph."""
-        camera, area = self.camera, self.area
-        return Ratio.between((area.height_px, area.width_px), (camera.image_height_px, camera.image_width_px), 1)
-
-    def maps_from(self, inner: Part, stride: int) -> RawMaps:
-        """The maps, as views, from where an area within this one begins."""
-        begins = inner.within(self.area)
-        down, across = round(begins.top * self.ratio.rows / stride), round(begins.left * self.ratio.columns / stride)
-        return {name: values[down:, across:] for name, values in self.maps.items()}
-
-
 class Estimator:
     """Made once from a model folder; ``estimate`` may be called from several threads at once."""
 
@@ -127,17 +101,24 @@ class Estimator:
         side: Side = "auto",
         cancellation: Cancellation | None = None,
         part: Part | None = None,
+        known: Sequence[KnownDepth] = (),
     ) -> DepthMap:
         """Depth of an upright photograph, uint8 [h, w, 3] sRGB, whose camera is at exactly that size.
 
-        Of a ``part`` alone it costs what the part and its surroundings cost. Raises ``ValueError`` for a camera of
-        another size and ``Cancelled`` when asked to stop.
+        Of a ``part`` alone it costs what the part and its surroundings cost. Where depths are ``known``, of pixels
+        within the photograph, it is first read from one to the other: the answer is then by the camera focused where
+        they say. Raises ``ValueError`` for a camera of another size and ``Cancelled`` when asked to stop.
         """
         height, width = rgb.shape[:2]
         if (width, height) != (camera.image_width_px, camera.image_height_px):
             raise ValueError(f"the camera must be that of a {width}x{height} image: resize it first")
         request = _Request(rgb, camera, side, cancellation or Cancellation(), part)
-        read = self._read_copies(request, self._base_scale(camera))
+        clues = self._clues(request, known)
+        if clues is not None:
+            request = replace(request, camera=clues.camera)
+        read = self._read_copies(request, self._base_scale(request.camera))
+        if clues is not None and side == "auto":
+            clues.lean(read)
         area, stopwatch = read.area, request.stopwatch
         size = (area.height_px, area.width_px)
         reading = Reading.of(read.maps, read.camera, size, self.manifest, side, read.most_blur_px)
@@ -150,7 +131,7 @@ class Estimator:
             depth_m=depth_m,
             valid=valid,
             layers=all_layers(reading, size),
-            camera=area.behind(camera),
+            camera=area.behind(request.camera),
             scales=read.scales,
             warnings=(),
             timings_ms=stopwatch.elapsed_ms,
@@ -160,25 +141,20 @@ class Estimator:
             within = part.within(area)
             answer, blur_px = answer.cut(within), within.cells_of(blur_px, size)
         blurrier = float((blur_px > read.most_blur_px / reading.scale).mean())
-        warnings = (*self._warnings(reading, whole=part is None), *_hardness(blurrier, answer.valid_fraction))
+        told = clues.warnings if clues is not None else ()
+        warnings = (*told, *self._warnings(reading, whole=part is None), *_hardness(blurrier, answer.valid_fraction))
         return replace(answer, warnings=warnings)
 
-    def read(
-        self,
-        rgb: NDArray[np.uint8],
-        camera: Camera,
-        side: Side = "auto",
-        *,
-        cancellation: Cancellation | None = None,
-        part: Part | None = None,
-        stopwatch: Stopwatch | None = None,
-    ) -> Read:
-        """What the networks answer, of a ``part`` and its surroundings or of all, before it is decided what that means.
+    def read(self, rgb: NDArray[np.uint8], camera: Camera, side: Side = "auto") -> Read:
+        """What the networks answer, before it is decided what that means: for measuring them."""
+        return self._read_copies(_Request(rgb, camera, side), self._base_scale(camera))
 
-        The stopwatch is given what it took.
-        """
-        request = _Request(rgb, camera, side, cancellation or Cancellation(), part, stopwatch or Stopwatch())
-        return self._read_copies(request, self._base_scale(camera))
+    def _clues(self, request: _Request, known: Sequence[KnownDepth]) -> Clues | None:
+        """What known depths tell, None where there are none."""
+        if not known:
+            return None
+        read = self._read_copies(replace(request, side="auto", part=around(known)), self._base_scale(request.camera))
+        return Clues.of(read, request.camera, known)
 
     def _base_scale(self, camera: Camera) -> float:
         """The largest copy whose k_cam the model reads well, or a smaller one of a large picture; never enlarged."""
@@ -193,14 +169,15 @@ class Estimator:
         maps = self._read_copy(request, area, working, scale)
         most_blur_px = self.manifest.ranges.blur_px.high
         strong_px = STRONG_BLUR * most_blur_px
-        read = Read(maps, working, area, (working.image_width_px / area.width_px,), most_blur_px)
+        scales = (working.image_width_px / area.width_px,)
+        read = Read(maps, working, area, self.manifest.stride, scales, most_blur_px)
         is_read_better = smaller > 0 and working.k_cam_px * COARSER >= self.manifest.ranges.k_cam_px.low
         if not is_read_better or float((maps["blur_px"] > strong_px).mean()) <= STRONG_FRACTION:
             return read
         told = self._read_copies(request, scale * COARSER, smaller - 1)
         with request.stopwatch.stage("correct"):
             ratio = Ratio(*(small / large for small, large in zip(told.ratio, read.ratio, strict=True)))
-            blend(maps, told.maps_from(area, self.manifest.stride), ratio, strong_px)
+            blend(maps, told.maps_from(area), ratio, strong_px)
         return replace(read, scales=read.scales + told.scales, most_blur_px=told.most_blur_px / COARSER)
 
     def _read_copy(self, request: _Request, area: Part, working: Camera, scale: float) -> RawMaps:
