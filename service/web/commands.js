@@ -5,6 +5,7 @@
  * @property {string} camera
  * @property {string} side
  * @property {number | null} focusM
+ * @property {import("./tape.js").KnownDepth[]} known
  * @property {string} format
  */
 
@@ -20,10 +21,11 @@ export const FORMATS = {
 };
 
 /** @param {Ask} ask @returns {string} path and query, relative to the page */
-export function depthPath({ camera, side, focusM, format }) {
+export function depthPath({ camera, side, focusM, known, format }) {
 	const query = new URLSearchParams({ camera });
 	if (side !== "auto") query.set("side", side);
 	if (focusM !== null) query.set("focus_distance_m", String(focusM));
+	for (const { u, v, depthM } of known) query.append("known", `${u},${v},${Number(depthM.toFixed(4))}`);
 	query.set("format", format);
 	return `depth?${query}`;
 }

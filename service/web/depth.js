@@ -13,16 +13,18 @@ import { ProblemBox } from "./problem_box.js";
 import { DepthReader } from "./reader.js";
 import { Distance, Readout, Timings, metres } from "./readout.js";
 import { Stage } from "./stage.js";
+import { Tape } from "./tape.js";
 import { html, useCallback, useEffect, useMemo, useRef, useState } from "./vendor/preact.js";
 
 /** @typedef {import("./maps.js").Facts} Facts */
 /** @typedef {import("./maps.js").Look} Look */
 /** @typedef {import("./maps.js").Reading} Reading */
 /** @typedef {{u: number, v: number}} Pixel */
+/** @typedef {import("./tape.js").KnownDepth} KnownDepth */
 
 /**
  * @typedef {object} Result
- * @property {{camera: string, side: string, focusM: number | null}} asked
+ * @property {{camera: string, side: string, focusM: number | null, known: KnownDepth[]}} asked
  * @property {File} file
  * @property {Facts} facts
  * @property {Blob} npz
@@ -54,6 +56,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 	const [name, setName] = useState("");
 	const [side, setSide] = useState("auto");
 	const [focusM, setFocusM] = useState(/** @type {number | null} */ (null));
+	const [known, setKnown] = useState(/** @type {KnownDepth[]} */ ([]));
 	const [attempt, setAttempt] = useState(0);
 	const [isDrafting, setIsDrafting] = useState(false);
 	const [phase, setPhase] = useState(/** @type {Phase | null} */ (null));
@@ -70,7 +73,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 	const newest = useRef(/** @type {File | null} */ (null));
 
 	const camera = cameras?.find((one) => one.name === name) ?? null;
-	const ask = { camera: name, side, focusM };
+	const ask = { camera: name, side, focusM, known };
 
 	useEffect(() => {
 		if (brought !== null) setName(brought);
@@ -81,6 +84,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 		setResult(null);
 		setReading(null);
 		setMarks([]);
+		setKnown([]);
 		setPhotograph(null);
 		setIsOpening(true);
 		setIsDrafting(false);
@@ -121,7 +125,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 		running.current = abort;
 		run(file, abort.signal);
 		return () => abort.abort();
-	}, [file, camera?.name, camera?.revision, side, focusM, attempt]);
+	}, [file, camera?.name, camera?.revision, side, focusM, known, attempt]);
 
 	/** @param {File} sent @param {AbortSignal} signal */
 	async function run(sent, signal) {
@@ -262,7 +266,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 								hidden=${result !== null && picture !== "photograph"}
 							>
 								<${Stage}
-									...${{ reader, size, look, reading, marks, measured, announce }}
+									...${{ reader, size, look, reading, marks, measured, known, announce }}
 									bitmap=${photograph?.bitmap ?? null}
 									result=${result}
 									onReading=${setReading}
@@ -290,6 +294,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 							<${Warnings} texts=${warned("result")} />
 							<${Readout} reading=${reading} />
 							<${Distance} ...${{ marks, measured }} hasPoints=${result.facts.hasPoints} onClear=${() => setMarks([])} />
+							<${Tape} mark=${marks.at(-1) ?? null} known=${known} onKnown=${setKnown} />
 							<${Colours} look=${look} facts=${result.facts} onLook=${setLook} />
 							<${Exports} key=${result.model + JSON.stringify(result.asked)} result=${result} announce=${announce} />
 							<${Timings} timings=${result.timings} model=${result.model} />

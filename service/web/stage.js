@@ -23,6 +23,7 @@ const HINT = "depth-stage-hint";
  *   reading: Reading | null,
  *   marks: Pixel[],
  *   measured: import("./depth.js").Measured | null,
+ *   known: import("./tape.js").KnownDepth[],
  *   onReading: (reading: Reading | null) => void,
  *   onMarks: (marks: Pixel[]) => void,
  *   onCounts: (counts: Uint32Array) => void,
@@ -30,7 +31,8 @@ const HINT = "depth-stage-hint";
  * }} props
  */
 export function Stage(props) {
-	const { reader, size, look, bitmap, result, reading, marks, measured, onReading, onMarks, onCounts, announce } = props;
+	const { reader, size, look, bitmap, result, reading, marks, measured, known } = props;
+	const { onReading, onMarks, onCounts, announce } = props;
 	const stage = useRef(/** @type {HTMLElement | null} */ (null));
 	const [divider, setDivider] = useState(0);
 	const [painted, setPainted] = useState(/** @type {ImageBitmap | null} */ (null));
@@ -161,7 +163,7 @@ export function Stage(props) {
 			</div>
 			${result &&
 			html`<div class="depth-divider" style=${{ left: portion }} aria-hidden="true"></div>
-				<${Marks} ...${{ size, reading, marks, measured }} />`}
+				<${Marks} ...${{ size, reading, marks, measured, known }} />`}
 		</div>
 		${result &&
 		html`<label class="depth-slide"
@@ -203,9 +205,10 @@ function Bitmap({ bitmap, name }) {
  *   reading: Reading | null,
  *   marks: Pixel[],
  *   measured: import("./depth.js").Measured | null,
+ *   known: import("./tape.js").KnownDepth[],
  * }} props
  */
-function Marks({ size, reading, marks, measured }) {
+function Marks({ size, reading, marks, measured, known }) {
 	const x = (/** @type {number} */ u) => `${((100 * (u + 0.5)) / size.width).toFixed(3)}%`;
 	const y = (/** @type {number} */ v) => `${((100 * (v + 0.5)) / size.height).toFixed(3)}%`;
 	const [from, to] = marks;
@@ -217,6 +220,10 @@ function Marks({ size, reading, marks, measured }) {
 			["rim", "line"].map(
 				(kind) =>
 					html`<line key=${kind} class=${kind} x1=${x(from.u)} y1=${y(from.v)} x2=${x(end.u)} y2=${y(end.v)} />`,
+			)}
+			${known.map(
+				({ u, v }) => html`<circle key=${`${u},${v}`} class="rim" cx=${x(u)} cy=${y(v)} r="4" />
+					<circle class="line depth-taped" cx=${x(u)} cy=${y(v)} r="4" />`,
 			)}
 			${marks.map(
 				({ u, v }, at) => html`<circle key=${at} class="rim" cx=${x(u)} cy=${y(v)} r="6" />

@@ -1,0 +1,77 @@
+/** What somebody has measured in the picture: the service fits the focus distance to it, and learns sides from it. */
+
+import { decimal } from "./numbers.js";
+import { metres } from "./readout.js";
+import { TextField } from "./text_field.js";
+import { html, useState } from "./vendor/preact.js";
+
+/** @typedef {{u: number, v: number, depthM: number}} KnownDepth */
+
+const NEAREST_M = 0.001;
+const FARTHEST_M = 99_999;
+
+/**
+ * @param {{
+ *   mark: import("./depth.js").Pixel | null,
+ *   known: KnownDepth[],
+ *   onKnown: (known: KnownDepth[]) => void,
+ * }} props
+ */
+export function Tape({ mark, known, onKnown }) {
+	const [text, setText] = useState("");
+	const [fault, setFault] = useState("");
+
+	/** @param {Event} event */
+	function add(event) {
+		event.preventDefault();
+		const depthM = decimal(text);
+		if (!(depthM >= NEAREST_M && depthM <= FARTHEST_M)) {
+			setFault("This is no distance in metres.");
+			return;
+		}
+		if (mark === null) return;
+		const others = known.filter(({ u, v }) => u !== mark.u || v !== mark.v);
+		setText("");
+		setFault("");
+		onKnown([...others, { ...mark, depthM }]);
+	}
+
+	return html`<section class="card stack" aria-label="Known by a tape">
+		<h3>Known by a tape</h3>
+		${mark === null
+			? html`<p class="hint">
+					Click what you have measured, and say how far it is. Two or three things, near and far, tell where the lens was
+					focused and which side things are on.
+				</p>`
+			: html`<form class="stack" onSubmit=${add}>
+					<${TextField}
+						id="depth-tape"
+						label=${`Distance of pixel ${mark.u}, ${mark.v} from the lens, m`}
+						kind="decimal"
+						value=${text}
+						fault=${fault}
+						hint="Along the lens' axis."
+						onInput=${(/** @type {string} */ typed) => {
+							setText(typed);
+							setFault("");
+						}}
+					/>
+					<div class="row"><button>Use it</button></div>
+				</form>`}
+		${known.length > 0 &&
+		html`<ul class="depth-known">
+			${known.map(
+				(one) => html`<li key=${`${one.u},${one.v}`}>
+					<span>${metres(one.depthM)} at ${one.u}, ${one.v}</span>
+					<button
+						type="button"
+						aria-label=${`Forget ${metres(one.depthM)} at ${one.u}, ${one.v}`}
+						onClick=${() => onKnown(known.filter((other) => other !== one))}
+					>
+						Forget
+					</button>
+				</li>`,
+			)}
+		</ul>`}
+	</section>`;
+}
