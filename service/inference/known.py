@@ -76,8 +76,8 @@ class Clues:
         defocus = [thin_lens.signed_defocus(point.depth_m, fit.focus_distance_m) for point in known]
         leanings = tuple(max(-1.0, min(1.0, -x / SURELY_OUT)) for x in defocus)
         told = (
-            f"focused at {fit.focus_distance_m:.3g} m ({fit.low_m:.3g} to {fit.high_m:.3g}) by {len(known)} known "
-            f"depths, where {camera.focus_distance_m:.4g} m was told"
+            f"focused at {fit.focus_distance_m:.3g} m ({fit.low_m:.3g} to {fit.high_m:.3g}), where "
+            f"{camera.focus_distance_m:.4g} m was told, by what is known of the depth"
         )
         doubted = (
             f"its blur speaks against the known depth of {point.depth_m:g} m at {point.u:g},{point.v:g}"

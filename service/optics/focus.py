@@ -1,18 +1,18 @@
 """Where a lens is focused, from the blur of things whose depth is known."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-
-import numpy as np
 
 from service.optics.camera import Camera
 
 # standard deviations of a logarithm: of the focus distance that was told, as by a ring, and the least of a blur read
 TOLD_ERROR = 0.1
 READING_ERROR = 0.1
-# Huber's loss: what is off by more deviations counts in proportion, so that one thing mistaken does not decide
-TAIL = 1.5
-FARTHEST_OFF, CANDIDATES = 1.7, 401
+# Cauchy's loss: what is off by more deviations than this counts ever less, so that one thing mistaken does not decide,
+# be it what was told
+TAIL = 2.5
+FARTHEST_OFF, CANDIDATES = 2.5, 601
 LEAST_BLUR_PX = 0.1
 CONFIDENCE_95 = 1.92  # half of the 95 % quantile of chi squared with one degree of freedom
 
@@ -41,20 +41,33 @@ def fit_focus(camera: Camera, sightings: Sequence[Sighting]) -> FocusFit:
 
     Blur is in pixels of the camera's pictures. A known depth tells its side of focus, so that, other than depth from
     blur, this has one answer; from a single sighting close to focus the interval holds both. Its ends are no farther
-    from the camera's focus distance than 1.7 times. Raises ``ValueError`` without a sighting.
+    from the camera's focus distance than 2.5 times. Raises ``ValueError`` without a sighting.
     """
     if not sightings:
         raise ValueError("a focus distance is fitted to one known depth or more")
-    factors = np.geomspace(1 / FARTHEST_OFF, FARTHEST_OFF, CANDIDATES)
-    factors = factors[factors * camera.focus_distance_m > (camera.focal_length_m or 0.0)]
-    candidates = [camera.focused_at(camera.focus_distance_m * factor) for factor in factors.tolist()]
-    shown_px = np.array([[candidate.blur_px(seen.depth_m) for seen in sightings] for candidate in candidates])
-    read_px = np.array([seen.blur_px for seen in sightings])
-    errors = np.array([max(seen.error, READING_ERROR) for seen in sightings])
-    off = np.abs(np.log(np.maximum(read_px, LEAST_BLUR_PX) / np.maximum(shown_px, LEAST_BLUR_PX))) / errors
-    loss = np.where(off < TAIL, off**2 / 2, TAIL * off - TAIL**2 / 2).sum(1)
-    loss += (np.log(factors) / TOLD_ERROR) ** 2 / 2
-    best = int(loss.argmin())
-    likely = np.flatnonzero(loss <= loss[best] + CONFIDENCE_95)
-    fitted_m, low_m, high_m = (candidates[place].focus_distance_m for place in (best, likely[0], likely[-1]))
-    return FocusFit(fitted_m, low_m, high_m, tuple(off[best].tolist()))
+    nearest_m = camera.focal_length_m or 0.0
+    factors = (FARTHEST_OFF ** (2 * place / (CANDIDATES - 1) - 1) for place in range(CANDIDATES))
+    distances_m = [m for m in (camera.focus_distance_m * factor for factor in factors) if m > nearest_m]
+    deviations = [_deviations(camera.focused_at(focus_m), sightings) for focus_m in distances_m]
+    losses = [
+        sum(map(_loss, (math.log(focus_m / camera.focus_distance_m) / TOLD_ERROR, *offs)))
+        for focus_m, offs in zip(distances_m, deviations, strict=True)
+    ]
+    best = losses.index(min(losses))
+    likely_m = [m for m, loss in zip(distances_m, losses, strict=True) if loss <= losses[best] + CONFIDENCE_95]
+    return FocusFit(distances_m[best], likely_m[0], likely_m[-1], deviations[best])
+
+
+def _loss(deviations: float) -> float:
+    return TAIL**2 / 2 * math.log1p((deviations / TAIL) ** 2)
+
+
+def _deviations(camera: Camera, sightings: Sequence[Sighting]) -> tuple[float, ...]:
+    """By how many standard deviations of its reading each blur is off the camera's, in ln lambda."""
+
+    def off(seen: Sighting) -> float:
+        shown_px = camera.blur_px(seen.depth_m)
+        ratio = max(seen.blur_px, LEAST_BLUR_PX) / max(shown_px, LEAST_BLUR_PX)
+        return abs(math.log(ratio)) / max(seen.error, READING_ERROR)
+
+    return tuple(map(off, sightings))

@@ -46,7 +46,7 @@ export function Tape({ mark, known, onKnown }) {
 			: html`<form class="stack" onSubmit=${add}>
 					<${TextField}
 						id="depth-tape"
-						label=${`Distance of pixel ${mark.u}, ${mark.v} from the lens, m`}
+						label=${`From the lens to ${mark.u}, ${mark.v} in m`}
 						kind="decimal"
 						value=${text}
 						fault=${fault}

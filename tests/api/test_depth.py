@@ -232,6 +232,23 @@ def test_a_lens_moves_focus_exactly_but_not_nearer_than_its_focal_length(
     assert problem["errors"][0]["pointer"] == "focus_distance_m"
 
 
+def test_known_depths_tell_where_this_shot_was_focused(bench: TestClient) -> None:
+    response = ask(bench, format="npy", known=["20,20,1.1", "70,50,1.1"])
+    told_m = depth_near(LEVEL)
+    assert response.headers["Camind-Focus-Distance-M"] != ask(bench).headers["Camind-Focus-Distance-M"] == "2"
+    assert abs(npy(response)[0, 0] - 1.1) < abs(told_m - 1.1) / 3
+    assert "where 2 m was told" in response.headers["Camind-Warnings"]
+    focus_m = float(response.headers["Camind-Focus-Distance-M"])
+    np.testing.assert_allclose(npy(ask(bench, format="npy", focus_distance_m=focus_m)), npy(response), rtol=1e-4)
+
+
+def test_known_depths_are_of_the_whole_whatever_part_is_asked_for(bench: TestClient) -> None:
+    whole, part = (ask(bench, format="npy", known="90,60,1.1", roi=roi) for roi in (None, "0,0,32,32"))
+    np.testing.assert_allclose(npy(part), npy(whole)[:32, :32], rtol=1e-4)
+    problem = refused(ask(bench, known="96,3,1.1"), 422, "96x64")
+    assert problem["errors"][0]["pointer"] == "known"
+
+
 @pytest.mark.parametrize(
     ("query", "word"),
     [
@@ -248,6 +265,12 @@ def test_a_lens_moves_focus_exactly_but_not_nearer_than_its_focal_length(
         ({"at": "nan,1"}, "u,v"),
         ({"at": "96,3", "format": "json"}, "96x64"),
         ({"at": "3,-1", "format": "json"}, "96x64"),
+        ({"known": "3,4"}, "u,v,depth_m"),
+        ({"known": "3,4,0"}, "u,v,depth_m"),
+        ({"known": "3,4,-1"}, "u,v,depth_m"),
+        ({"known": "3,4,inf"}, "u,v,depth_m"),
+        ({"known": "3,4,123456"}, "u,v,depth_m"),
+        ({"known": ["3,4,1.5"] * 101}, "100"),
         ({"roi": "1,2,3"}, "roi"),
         ({"roi": "-1,2,3,4"}, "roi"),
         ({"colour": "red"}, "colour"),
@@ -404,5 +427,5 @@ def test_the_document_lists_every_form_and_every_kind(client: TestClient) -> Non
     assert {"image/jpeg", "image/png", "multipart/form-data"} <= set(operation["requestBody"]["content"])
     assert {"404", "406", "413", "415", "422", "503"} <= set(operation["responses"])
     assert {parameter["name"] for parameter in operation["parameters"]} == {
-        *("camera", "side", "format", "at", "roi", "focus_distance_m")
+        *("camera", "side", "format", "at", "roi", "focus_distance_m", "known")
     }

@@ -108,6 +108,22 @@ def test_a_wrong_focus_distance_is_told_to_the_estimator(oracle: Examiner, mode:
     assert outcome.median_error == pytest.approx(abs(factor * (1 + x) / (1 + factor * x) - 1), rel=1e-3)
 
 
+def test_known_depths_make_up_for_a_wrong_focus_distance(oracle: Examiner) -> None:
+    told, known = (
+        oracle.answer(case(1.0), mode)[0].scores.abs_rel for mode in ("focus +10%", "focus +10%, known depths")
+    )
+    assert told > 0.03
+    assert known < told / 3
+
+
+def test_what_a_user_knows_is_something_near_something_between_and_something_far() -> None:
+    truth = np.linspace(0.5, 3.5, 61, dtype=np.float32).reshape(1, 61).repeat(4, 0)
+    truth[:2] = np.nan
+    known = replace(case(1.0), truth_m=truth).known_depths
+    np.testing.assert_allclose([point.depth_m for point in known], [1.0, 2.0, 3.0], atol=0.05)
+    assert all(truth[int(point.v), int(point.u)] == point.depth_m for point in known)
+
+
 def test_a_camera_known_by_its_sheets_alone_is_nearly_the_true_one() -> None:
     found = calibrated(REFERENCE)
     assert 0 < abs(found.k_cam_px / REFERENCE.k_cam_px - 1) < 0.03

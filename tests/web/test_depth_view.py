@@ -304,6 +304,39 @@ def test_another_side_or_focus_is_read_again(measured: Page, maps: Callable[...,
         assert number_in(measured, "depth") == pytest.approx(maps(query)["depth_m"][216, 322], abs=0.0006)
 
 
+def test_what_a_tape_says_moves_the_focus_and_can_be_forgotten(
+    measured: Page, maps: Callable[..., Any], barriers: Callable[[Page], list[str]]
+) -> None:
+    known = measured.get_by_role("region", name="Known by a tape")
+    add = known.get_by_role("button", name="Use it")
+    expect(add).to_have_count(0)
+    picture = stage(measured)
+    picture.click(position=place_of(picture, 322, 216))
+    field = known.get_by_label("From the lens to 322, 216 in m")
+    field.fill("far")
+    add.click()
+    expect(known.get_by_text("This is no distance in metres.")).to_be_visible()
+    field.fill("1,5")
+    assert barriers(measured) == []
+
+    def reads(query: str) -> None:
+        picture = stage(measured)
+        picture.hover(position=place_of(picture, 50, 50))
+        picture.hover(position=place_of(picture, 322, 216))
+        expect(measured.locator("[data-value=pixel]")).to_have_text("322, 216")
+        assert number_in(measured, "depth") == pytest.approx(maps(query)["depth_m"][216, 322], abs=0.0006)
+
+    with measured.expect_response(lambda answer: "/depth?" in answer.url):
+        field.press("Enter")
+    reads("&known=322,216,1.5")
+    expect(measured.get_by_text("where 2 m was told")).to_be_visible()
+    expect(measured.locator(".depth-taped")).to_have_count(1)
+    with measured.expect_response(lambda answer: "/depth?" in answer.url):
+        known.get_by_role("button", name="Forget 1.500 m at 322, 216").click()
+    reads("")
+    expect(measured.locator(".depth-taped")).to_have_count(0)
+
+
 def test_points_in_space_are_drawn_turned_and_counted(measured: Page, maps: Callable[..., Any]) -> None:
     measured.get_by_role("tab", name="3D").click()
     cloud = measured.get_by_role("application", name="Points in space")

@@ -1,0 +1,117 @@
+"""Known depths through real graphs: the focus distance follows from them, and sides do."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from service.inference.artifact import load_model_folder
+from service.inference.estimator import Estimator
+from service.inference.known import KnownDepth
+from service.inference.part import Part
+from service.optics.camera import Camera
+from tests.inference.oracle_pair import brightness_for, build_oracle_pair
+
+TOLD = Camera(384, 256, 2.0, 6.0, 0.5)
+TRUE = TOLD.focused_at(1.8)
+LEFT_M, RIGHT_M = 1.0, 3.0
+KNOWN = (KnownDepth(60, 120, LEFT_M), KnownDepth(330, 40, RIGHT_M))
+EVENLY = 128
+
+
+@pytest.fixture(scope="module")
+def estimator(tmp_path_factory: pytest.TempPathFactory) -> Estimator:
+    return Estimator.from_folder(load_model_folder(build_oracle_pair(tmp_path_factory.mktemp("model"))))
+
+
+def photograph(red: int | None = None) -> NDArray[np.uint8]:
+    """A near thing beside a far one, as the true camera shows them; ``red`` is what the oracle takes for the side."""
+    picture = np.empty((256, 384, 3), np.uint8)
+    picture[:, :192] = brightness_for(TRUE.blur_px(LEFT_M))
+    picture[:, 192:] = brightness_for(TRUE.blur_px(RIGHT_M))
+    if red is not None:
+        # the oracle reads blur off the mean of the colours
+        picture[..., 1:] = np.clip((3 * picture[..., :1].astype(int) - red) / 2, 0, 255).round()
+        picture[..., 0] = red
+    return picture
+
+
+def test_the_answer_is_by_the_camera_focused_where_known_depths_say(estimator: Estimator) -> None:
+    told, corrected = (estimator.estimate(photograph(), TOLD, "near", known=known) for known in ((), KNOWN))
+    assert corrected.camera.focus_distance_m == pytest.approx(1.8, rel=0.03)
+    assert corrected.camera.k_cam_px == pytest.approx(TRUE.k_cam_px, rel=0.03)
+    assert told.depth_m[120, 60] > 1.05 * LEFT_M
+    assert corrected.depth_m[120, 60] == pytest.approx(LEFT_M, rel=0.03)
+    assert told.warnings == ()
+    assert len(corrected.warnings) == 1
+    assert "where 2 m was told" in corrected.warnings[0]
+
+
+def test_a_side_that_is_known_is_that_of_what_is_like_it_and_near_by(estimator: Estimator) -> None:
+    answer = estimator.estimate(photograph(red=EVENLY), TOLD, known=KNOWN)
+    near, far = answer.depth_m[110:130, 50:70], answer.depth_m[30:50, 320:340]
+    np.testing.assert_allclose(near, LEFT_M, rtol=0.05)
+    np.testing.assert_allclose(far, RIGHT_M, rtol=0.1)
+    assert (answer.p_near[110:130, 50:70] > 0.9).all()
+    assert (answer.p_near[30:50, 320:340] < 0.1).all()
+
+
+def test_things_of_other_blur_are_told_less(estimator: Estimator) -> None:
+    picture = photograph(red=EVENLY)
+    picture[100:140, 70:90] = photograph(red=EVENLY)[0, 300]
+    p_near = estimator.estimate(picture, TOLD, known=KNOWN[:1]).p_near
+    assert p_near[120, 60] > p_near[120, 80]
+    assert p_near[120, 60] > p_near[120, 150] > 0.5
+
+
+def test_where_the_model_mistakes_a_side_all_others_are_doubted(estimator: Estimator) -> None:
+    other_m = 0.95
+    picture = photograph(red=100)
+    picture[:40, :40] = brightness_for(TRUE.blur_px(other_m))
+    picture[:40, :40, 0] = 20  # taken for far, though near
+    before, after = (
+        estimator.estimate(picture, TOLD, known=known).p_near[250, 380] for known in ((), [KnownDepth(10, 10, other_m)])
+    )
+    assert after > before + 0.1
+
+
+def test_a_side_that_is_asked_for_stays(estimator: Estimator) -> None:
+    answer = estimator.estimate(photograph(red=EVENLY), TOLD, "far", known=KNOWN)
+    assert (answer.p_near == 0).all()
+
+
+def test_a_depth_that_blur_speaks_against_is_told_of(estimator: Estimator) -> None:
+    known = (*KNOWN, KnownDepth(340, 200, RIGHT_M), KnownDepth(90, 200, 1.7))
+    answer = estimator.estimate(photograph(), TOLD, "near", known=known)
+    assert [warning for warning in answer.warnings if "speaks against" in warning] == [
+        "its blur speaks against the known depth of 1.7 m at 90,200"
+    ]
+    assert answer.camera.focus_distance_m == pytest.approx(1.8, rel=0.05)
+
+
+def test_a_part_has_the_answers_of_the_whole_wherever_the_known_depths_are(estimator: Estimator) -> None:
+    picture, part = photograph(red=EVENLY), Part(192, 128, 384, 256)
+    whole = estimator.estimate(picture, TOLD, known=KNOWN)
+    asked = estimator.estimate(picture, TOLD, part=part, known=KNOWN)
+    assert asked.camera.focus_distance_m == whole.camera.focus_distance_m
+    np.testing.assert_allclose(asked.depth_m, whole.depth_m[128:256, 192:384], rtol=1e-3)
+
+
+def test_a_photograph_that_is_read_on_a_smaller_copy_has_the_same_answer(estimator: Estimator) -> None:
+    large = replace(TOLD, k_cam_px=24.0)
+    true = large.focused_at(1.8)
+    picture = np.empty((256, 384, 3), np.uint8)
+    picture[:, :192], picture[:, 192:] = (brightness_for(true.blur_px(z) / 2) for z in (1.3, 2.4))
+    known = [KnownDepth(60, 120, 1.3), KnownDepth(330, 40, 2.4)]
+    answer = estimator.estimate(picture, large, "near", known=known)
+    assert answer.scales[0] == pytest.approx(0.5, abs=0.05)
+    assert answer.camera.focus_distance_m == pytest.approx(1.8, rel=0.03)
+    assert answer.depth_m[120, 60] == pytest.approx(1.3, rel=0.03)
+
+
+@pytest.mark.parametrize("at", [(-0.5, -0.5), (383.4, 255.4), (0, 255), (383, 0)])
+def test_pixels_may_be_at_the_very_edge(estimator: Estimator, at: tuple[float, float]) -> None:
+    depth_m = LEFT_M if at[0] < 192 else RIGHT_M
+    answer = estimator.estimate(photograph(), TOLD, known=[KnownDepth(*at, depth_m)])
+    assert 1.7 < answer.camera.focus_distance_m < 2.0

@@ -1,0 +1,76 @@
+"""Where a lens was focused, from blur at known depths."""
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.optics.camera import Camera
+from service.optics.focus import FARTHEST_OFF, FocusFit, Sighting, fit_focus
+
+CAMERA = Camera(640, 480, 2.0, 3.81, 0.5, focal_length_m=0.05)
+DEPTHS_M = (0.8, 1.2, 1.5, 2.5, 3.5)
+EXACT = 0.01
+
+
+def fitted(true_m: float, *depths_m: float, told: Camera = CAMERA, error: float = EXACT) -> FocusFit:
+    """What follows from blur as the camera's lens shows it, focused where it is not told to be."""
+    true = told.focused_at(true_m)
+    return fit_focus(told, [Sighting(depth_m, true.blur_px(depth_m), error) for depth_m in depths_m])
+
+
+@given(times=st.floats(0.85, 1.15), focal_length_m=st.sampled_from([None, 0.004, 0.1]), k_cam_px=st.floats(2, 40))
+def test_things_near_and_far_tell_the_focus_distance(
+    times: float, focal_length_m: float | None, k_cam_px: float
+) -> None:
+    told = replace(CAMERA, focal_length_m=focal_length_m, k_cam_px=k_cam_px)
+    fit = fitted(2.0 * times, *DEPTHS_M, told=told)
+    assert fit.focus_distance_m == pytest.approx(2.0 * times, rel=0.04)
+    assert fit.low_m <= 2.0 * times <= fit.high_m
+    assert max(fit.deviations) < 1
+
+
+def test_one_thing_tells_it_less_surely_than_three() -> None:
+    one, three = fitted(1.8, 1.2), fitted(1.8, 1.0, 1.2, 3.0)
+    assert abs(three.focus_distance_m - 1.8) < abs(one.focus_distance_m - 1.8) < 0.2
+    assert three.high_m - three.low_m < one.high_m - one.low_m
+
+
+def test_of_one_thing_close_to_focus_either_side_of_it_is_possible() -> None:
+    fit = fitted(1.9, 2.0)
+    assert fit.low_m < 1.9 < 2.1 < fit.high_m
+
+
+def test_a_doubtful_reading_moves_it_less() -> None:
+    sure, doubtful = (fitted(1.6, 1.2, error=error).focus_distance_m for error in (0.1, 0.8))
+    assert 1.6 < sure < doubtful < 2.0
+
+
+def test_one_thing_mistaken_does_not_decide_and_is_told_apart() -> None:
+    true = CAMERA.focused_at(1.8)
+    seen = [Sighting(depth_m, true.blur_px(depth_m), EXACT) for depth_m in DEPTHS_M]
+    fit = fit_focus(CAMERA, [replace(seen[0], depth_m=1.6), *seen[1:]])
+    assert fit.focus_distance_m == pytest.approx(1.8, rel=0.05)
+    assert fit.deviations[0] > 3 > max(fit.deviations[1:])
+
+
+def test_what_fits_nothing_leaves_it_near_what_was_told() -> None:
+    fit = fit_focus(CAMERA, [Sighting(1.0, 300.0, EXACT)])
+    assert 2.0 / FARTHEST_OFF <= fit.focus_distance_m <= 2.0 * FARTHEST_OFF
+    assert fit.deviations[0] > 3
+
+
+def test_a_lens_is_never_focused_nearer_than_its_focal_length() -> None:
+    macro = Camera(640, 480, 0.12, 40.0, 0.5, focal_length_m=0.1)
+    assert fit_focus(macro, [Sighting(0.11, 0.5, EXACT)]).low_m > 0.1
+
+
+def test_without_gamma_a_thing_in_focus_has_no_blur_and_is_no_fault() -> None:
+    fit = fit_focus(replace(CAMERA, gamma_px=0.0), [Sighting(2.0, 0.0, EXACT)])
+    assert fit.focus_distance_m == pytest.approx(2.0)
+
+
+def test_nothing_known_tells_nothing() -> None:
+    with pytest.raises(ValueError, match="one known depth"):
+        fit_focus(CAMERA, [])
