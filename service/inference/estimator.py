@@ -115,13 +115,16 @@ class Estimator:
         request = _Request(rgb, camera, side, cancellation or Cancellation(), part)
         clues = self._clues(request, known)
         if clues is not None:
-            request = replace(request, camera=clues.camera)
+            request = replace(request, camera=clues.camera, part=part and around(known, part))
         read = self._read_copies(request, self._base_scale(request.camera))
+        likeness = clues and clues.likeness(read)
         if clues is not None and side == "auto":
-            clues.lean(read)
+            clues.lean(read.maps["p_near"], likeness)
         area, stopwatch = read.area, request.stopwatch
         size = (area.height_px, area.width_px)
         reading = Reading.of(read.maps, read.camera, size, self.manifest, side, read.most_blur_px)
+        if clues is not None:
+            clues.anchor(reading.depth_m, read, likeness)
         if area.height_px * area.width_px > SMALL_PX:
             self._freeing.ask()  # what a large picture has taken is kept for the next one, but for a while only
         request.cancellation.check()

@@ -15,6 +15,7 @@ from service.inference.copies import Read
 from service.inference.hypotheses import SIGMA_OF_LAPLACE
 from service.inference.layout import LEAST_DOUBT, add_odds
 from service.inference.part import Part
+from service.inference.resampling import bands
 from service.opencv import cv2
 from service.optics import thin_lens
 from service.optics.camera import Camera
@@ -27,6 +28,7 @@ SHARED_ODDS = 2.0  # standard deviation, over pictures, of what all of a picture
 OWN_ODDS = 3.0
 REACH = 0.1  # of the longer side: standard deviation of what is near by
 LIKE_BLUR = 0.3  # standard deviation of ln lambda of what is as blurred
+MOST_ANCHORED = float(np.log(2))
 MOST_CELLS = 320
 SHIFTS = np.linspace(-8, 8, 321)
 
@@ -42,10 +44,14 @@ class KnownDepth:
     depth_m: float
 
 
-def around(known: Sequence[KnownDepth]) -> Part:
-    """The least part of the photograph that holds all pixels."""
-    rows, columns = [round(point.v) for point in known], [round(point.u) for point in known]
-    return Part(min(columns), min(rows), max(columns) + 1, max(rows) + 1)
+def around(known: Sequence[KnownDepth], part: Part | None = None) -> Part:
+    """The least part of the photograph that holds all pixels, and another part."""
+    left, top, right, bottom = zip(
+        *((round(point.u), round(point.v), round(point.u) + 1, round(point.v) + 1) for point in known),
+        *([(part.left, part.top, part.right, part.bottom)] if part else []),
+        strict=True,
+    )
+    return Part(min(left), min(top), max(right), max(bottom))
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,21 +99,38 @@ class Clues:
             _shift(np.array(p_near), np.array(leanings)),
         )
 
-    def lean(self, read: Read) -> None:
-        """Draw ``p_near`` of maps that were read with this camera towards the sides that are known."""
-        p_near, blur_px = read.maps["p_near"], read.maps["blur_px"]
+    def likeness(self, read: Read) -> Array:
+        """How much each known depth says of a place in the maps, [n, h, w] of 0 to 1, on no more cells than needed."""
+        blur_px = read.maps["blur_px"]
         shrink = max(1.0, max(blur_px.shape) / MOST_CELLS)
         rows, columns = (max(1, round(cells / shrink)) for cells in blur_px.shape)
         coarse = np.asarray(cv2.resize(blur_px, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
         log_blur = np.log(coarse / np.float32(read.ratio.columns))
         v, u = read.places(rows, columns)
-        reach_px = REACH * max(self.camera.image_width_px, self.camera.image_height_px)
-        odds = np.full_like(log_blur, self.shift)
-        for point, blur, leaning in zip(self.known, self.blur_px, self.leanings, strict=True):
-            off = ((v - point.v) / reach_px)[:, np.newaxis] ** 2 + ((u - point.u) / reach_px) ** 2
-            off += ((log_blur - np.log(blur)) / LIKE_BLUR) ** 2
-            odds += OWN_ODDS * leaning * np.exp(-off / 2)
-        add_odds(p_near, odds, p_near.shape)
+        reach_px = np.float32(REACH * max(self.camera.image_width_px, self.camera.image_height_px))
+        like = np.empty((len(self.known), rows, columns), np.float32)
+        for out, point, blur in zip(like, self.known, self.blur_px, strict=True):
+            out[:] = ((v - point.v) / reach_px)[:, np.newaxis] ** 2 + ((u - point.u) / reach_px) ** 2
+            out += ((log_blur - np.log(blur)) / LIKE_BLUR) ** 2
+        return np.exp(like / -2)
+
+    def lean(self, p_near: Array, likeness: Array) -> None:
+        """Draw probabilities of being near, of maps that were read by this camera, towards the sides that are known."""
+        add_odds(p_near, self.shift + OWN_ODDS * _spread(self.leanings, likeness), p_near.shape)
+
+    def anchor(self, depth_m: Array, read: Read, likeness: Array) -> None:
+        """Take what depth is off by where it is known, as a factor, from what is like it and near by."""
+        off = [np.log(point.depth_m / depth_m[read.cell_of(point.u, point.v)]) for point in self.known]
+        log_factor = _spread([max(-MOST_ANCHORED, min(MOST_ANCHORED, float(each))) for each in off], likeness)
+        enlarged = np.asarray(cv2.resize(log_factor, depth_m.shape[::-1], interpolation=cv2.INTER_LINEAR))
+        for rows in bands(depth_m.shape):
+            depth_m[rows] *= np.exp(enlarged[rows])
+
+
+def _spread(values: Sequence[float], likeness: Array) -> Array:
+    """A map of values that are known in places: theirs there, their mean where several count, falling to 0 elsewhere."""
+    given = np.tensordot(np.array(values, np.float32), likeness, 1)
+    return np.asarray(given / np.maximum(likeness.sum(0), 1), np.float32)
 
 
 def _shift(p_near: NDArray[np.float64], leanings: NDArray[np.float64]) -> float:
