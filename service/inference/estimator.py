@@ -3,6 +3,7 @@
 import weakref
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Self
 
 import numpy as np
@@ -107,7 +108,8 @@ class Estimator:
 
         Of a ``part`` alone it costs what the part and its surroundings cost. Where depths are ``known``, of pixels
         within the photograph, it is first read from one to the other: the answer is then by the camera focused where
-        they say. Raises ``ValueError`` for a camera of another size and ``Cancelled`` when asked to stop.
+        they say, and theirs where they are. Raises ``ValueError`` for a camera of another size and ``Cancelled`` when
+        asked to stop.
         """
         height, width = rgb.shape[:2]
         if (width, height) != (camera.image_width_px, camera.image_height_px):
@@ -117,14 +119,9 @@ class Estimator:
         if clues is not None:
             request = replace(request, camera=clues.camera, part=part and around(known, part))
         read = self._read_copies(request, self._base_scale(request.camera))
-        likeness = clues and clues.likeness(read)
-        if clues is not None and side == "auto":
-            clues.lean(read.maps["p_near"], likeness)
         area, stopwatch = read.area, request.stopwatch
         size = (area.height_px, area.width_px)
-        reading = Reading.of(read.maps, read.camera, size, self.manifest, side, read.most_blur_px)
-        if clues is not None:
-            clues.anchor(reading.depth_m, read, likeness)
+        reading = self._reading(request, read, clues)
         if area.height_px * area.width_px > SMALL_PX:
             self._freeing.ask()  # what a large picture has taken is kept for the next one, but for a while only
         request.cancellation.check()
@@ -157,7 +154,22 @@ class Estimator:
         if not known:
             return None
         read = self._read_copies(replace(request, side="auto", part=around(known)), self._base_scale(request.camera))
-        return Clues.of(read, request.camera, known)
+        with request.stopwatch.stage("correct"):
+            return Clues.of(read, request.camera, known)
+
+    def _reading(self, request: _Request, read: Read, clues: Clues | None) -> Reading:
+        """What the networks' maps, which are written over, and known depths say together."""
+        size = (read.area.height_px, read.area.width_px)
+        reading = partial(Reading.of, read.maps, read.camera, size, self.manifest, request.side, read.most_blur_px)
+        if clues is None:
+            return reading()
+        with request.stopwatch.stage("correct"):
+            likeness = clues.likeness(read)
+            if request.side == "auto":
+                clues.lean(read.maps["p_near"], likeness)
+            told = reading()
+            clues.anchor(told.depth_m, read, likeness)
+        return told
 
     def _base_scale(self, camera: Camera) -> float:
         """The largest copy whose k_cam the model reads well, or a smaller one of a large picture; never enlarged."""

@@ -1,7 +1,8 @@
 """Depths that somebody knows, by a tape: from them follows what no picture shows, where its lens was focused.
 
 So does on which side of focus things are: there where depth is known, in what is near by and as blurred, and, as a
-network that errs about one thing's side errs about others', a little everywhere.
+network that errs about one thing's side errs about others', a little everywhere. What depth is off by where it is known
+it is off by in what is near by and as blurred, too.
 """
 
 from collections.abc import Sequence
@@ -128,7 +129,7 @@ class Clues:
 
 
 def _spread(values: Sequence[float], likeness: Array) -> Array:
-    """A map of values that are known in places: theirs there, their mean where several count, falling to 0 elsewhere."""
+    """A map of values that are known in places: theirs there, their mean where several count, 0 far from all."""
     given = np.tensordot(np.array(values, np.float32), likeness, 1)
     return np.asarray(given / np.maximum(likeness.sum(0), 1), np.float32)
 

@@ -76,6 +76,22 @@ def test_where_the_model_mistakes_a_side_all_others_are_doubted(estimator: Estim
     assert after > before + 0.1
 
 
+def test_where_depth_is_known_the_answer_is_that_and_far_from_there_it_is_the_blurs(estimator: Estimator) -> None:
+    at_m = 0.93 * LEFT_M  # what blur says is 1 m
+    known = [*KNOWN, *(KnownDepth(u, 180, LEFT_M) for u in (120, 140, 160)), KnownDepth(20, 20, at_m)]
+    depth_m = estimator.estimate(photograph(), TOLD, "near", known=known).depth_m
+    assert depth_m[20, 20] == pytest.approx(at_m, rel=0.005)
+    assert depth_m[20, 60] > 1.01 * depth_m[20, 20]
+    assert depth_m[120, 60] == pytest.approx(LEFT_M, rel=0.01)
+    assert depth_m[240, 100] == pytest.approx(LEFT_M, rel=0.03)
+
+
+def test_no_known_depth_moves_an_answer_to_more_than_twice_or_half(estimator: Estimator) -> None:
+    known = (*KNOWN, KnownDepth(61, 121, LEFT_M), KnownDepth(20, 20, 50.0))
+    depth_m = estimator.estimate(photograph(), TOLD, "near", known=known).depth_m
+    assert depth_m[20, 20] == pytest.approx(2 * LEFT_M, rel=0.05)
+
+
 def test_a_side_that_is_asked_for_stays(estimator: Estimator) -> None:
     answer = estimator.estimate(photograph(red=EVENLY), TOLD, "far", known=KNOWN)
     assert (answer.p_near == 0).all()
