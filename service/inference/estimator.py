@@ -168,7 +168,7 @@ class Estimator:
             if request.side == "auto":
                 clues.lean(read.maps["p_near"], likeness)
             told = reading()
-            clues.anchor(told.depth_m, read, likeness)
+            clues.anchor(told, read, likeness)
         return told
 
     def _base_scale(self, camera: Camera) -> float:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.inference.copies import Read
+from service.inference.depth_map import MAX_RELATIVE_ERROR, Reading
 from service.inference.hypotheses import SIGMA_OF_LAPLACE
 from service.inference.layout import LEAST_DOUBT, add_odds
 from service.inference.part import Part
@@ -29,6 +30,7 @@ SHARED_ODDS = 2.0  # standard deviation, over pictures, of what all of a picture
 OWN_ODDS = 3.0
 REACH = 0.1  # of the longer side: standard deviation of what is near by
 LIKE_BLUR = 0.3  # standard deviation of ln lambda of what is as blurred
+TAPE_ERROR = np.float32(0.02)
 MOST_ANCHORED = float(np.log(2))
 MOST_CELLS = 320
 SHIFTS = np.linspace(-8, 8, 321)
@@ -119,13 +121,23 @@ class Clues:
         """Draw probabilities of being near, of maps that were read by this camera, towards the sides that are known."""
         add_odds(p_near, self.shift + OWN_ODDS * _spread(self.leanings, likeness), p_near.shape)
 
-    def anchor(self, depth_m: Array, read: Read, likeness: Array) -> None:
-        """Take what depth is off by where it is known, as a factor, from what is like it and near by."""
+    def anchor(self, reading: Reading, read: Read, likeness: Array) -> None:
+        """Take what depth is off by where it is known, as a factor, from what is like it and near by.
+
+        As far as that is so, a stated error is the tape's.
+        """
+        depth_m, error = reading.depth_m, reading.error
         off = [np.log(point.depth_m / depth_m[read.cell_of(point.u, point.v)]) for point in self.known]
-        log_factor = _spread([max(-MOST_ANCHORED, min(MOST_ANCHORED, float(each))) for each in off], likeness)
-        enlarged = np.asarray(cv2.resize(log_factor, depth_m.shape[::-1], interpolation=cv2.INTER_LINEAR))
+        factor = _spread([max(-MOST_ANCHORED, min(MOST_ANCHORED, float(each))) for each in off], likeness)
+        size = depth_m.shape[::-1]
+        log_factor, share = (
+            np.asarray(cv2.resize(each, size, interpolation=cv2.INTER_LINEAR), np.float32)
+            for each in (factor, likeness.max(0) ** 2)
+        )
         for rows in bands(depth_m.shape):
-            depth_m[rows] *= np.exp(enlarged[rows])
+            depth_m[rows] *= np.exp(log_factor[rows])
+            known = np.sqrt((1 - share[rows]) * error[rows] ** 2 + share[rows] * TAPE_ERROR**2)
+            np.copyto(error[rows], known, where=error[rows] <= MAX_RELATIVE_ERROR)
 
 
 def _spread(values: Sequence[float], likeness: Array) -> Array:

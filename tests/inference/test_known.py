@@ -1,6 +1,7 @@
 """Known depths through real graphs: the focus distance follows from them, and sides do."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +24,12 @@ EVENLY = 128
 @pytest.fixture(scope="module")
 def estimator(tmp_path_factory: pytest.TempPathFactory) -> Estimator:
     return Estimator.from_folder(load_model_folder(build_oracle_pair(tmp_path_factory.mktemp("model"))))
+
+
+@pytest.fixture(scope="module")
+def doubtful_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A model that states errors of 10 %."""
+    return build_oracle_pair(tmp_path_factory.mktemp("doubtful"), depth_scale=0.07)
 
 
 def photograph(red: int | None = None) -> NDArray[np.uint8]:
@@ -84,6 +91,18 @@ def test_where_depth_is_known_the_answer_is_that_and_far_from_there_it_is_the_bl
     assert depth_m[20, 60] > 1.01 * depth_m[20, 20]
     assert depth_m[120, 60] == pytest.approx(LEFT_M, rel=0.01)
     assert depth_m[240, 100] == pytest.approx(LEFT_M, rel=0.03)
+
+
+def test_an_error_is_the_tapes_where_depth_is_known_and_the_models_far_from_there(doubtful_model: Path) -> None:
+    doubtful = Estimator.from_folder(load_model_folder(doubtful_model))
+    stated = {}
+    for known in ((), KNOWN):
+        answer = doubtful.estimate(photograph(), TOLD, "near", known=known)
+        stated[len(known)] = answer.sigma_m / answer.depth_m
+    assert stated[0].min() > 0.09
+    assert stated[2][120, 60] == pytest.approx(0.02, abs=0.005)
+    assert stated[2][120, 60] < stated[2][120, 90] < stated[2][120, 150]
+    assert stated[2][250, 180] == pytest.approx(stated[0][250, 180], rel=0.1)
 
 
 def test_no_known_depth_moves_an_answer_to_more_than_twice_or_half(estimator: Estimator) -> None:
