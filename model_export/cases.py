@@ -44,7 +44,7 @@ FIXED = "fixed"
 FIXED_SCENES = 6
 ORACLE_FACTORS = (0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.4, 1.6)
 MISFOCUSED = ("focus -10%", "focus +10%")
-KNOWN_DEPTHS = ", known depths"  # after another mode's name: the focus distance is then fitted to these
+KNOWN_DEPTHS = ", known depths"  # after the name of another mode: three depths of each picture are known besides
 KNOWN_RANKS = (1 / 6, 3 / 6, 5 / 6)
 PROCEDURAL_SIDES = {"near": -1, "far": 1, "mixed": 0}
 

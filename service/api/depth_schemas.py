@@ -29,7 +29,6 @@ def _require_known(value: str) -> str:
 
 
 Point = Annotated[str, AfterValidator(_require_point), Field(json_schema_extra={"pattern": POINT})]
-
 Known = Annotated[str, AfterValidator(_require_known), Field(json_schema_extra={"pattern": KNOWN})]
 
 

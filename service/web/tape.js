@@ -1,4 +1,4 @@
-/** What somebody has measured in the picture: the service fits the focus distance to it, and learns sides from it. */
+/** What somebody has measured in the picture: depths that the service is told, and answers the rest by. */
 
 import { decimal } from "./numbers.js";
 import { metres } from "./readout.js";
