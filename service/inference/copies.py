@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 from service.inference.pair import RawMaps
 from service.inference.part import Part
 from service.inference.resampling import Ratio, bands, sample
+from service.opencv import cv2, log
 from service.optics.camera import Camera
+
+OCTAVES = np.float32(1 / np.log(2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,11 +70,16 @@ def blend(maps: RawMaps, coarse: RawMaps, ratio: Ratio, strong_px: float) -> Non
     """
     height, width = maps["blur_px"].shape
     # a copy's cells may cover half a cell less than there is
-    wider = {name: np.pad(values, ((0, 0), (0, 1)), "edge") for name, values in coarse.items()}
+    wider = {name: _continued(values) for name, values in coarse.items()}
     for rows in bands((height, width)):
         told = {name: sample(values, ratio, rows, width) for name, values in wider.items()}
         told["blur_px"] /= np.float32(ratio.columns)
         least_px = np.minimum(told["blur_px"], maps["blur_px"][rows])
-        share = np.clip(np.log2(least_px / np.float32(strong_px)), 0, 1)
+        share = np.clip(log(least_px / np.float32(strong_px)) * OCTAVES, 0, 1)
         for name, values in maps.items():
             values[rows] += share * (told[name] - values[rows])
+
+
+def _continued(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A map one column wider."""
+    return np.asarray(cv2.copyMakeBorder(values, 0, 0, 0, 1, cv2.BORDER_REPLICATE), np.float32)

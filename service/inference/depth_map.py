@@ -13,6 +13,7 @@ from service.inference.hypotheses import SIGMA_OF_LAPLACE, merged
 from service.inference.pair import RawMaps, Side
 from service.inference.part import Part
 from service.inference.resampling import Ratio, bands, sample
+from service.opencv import exp
 from service.optics import thin_lens
 from service.optics.camera import Camera
 
@@ -62,19 +63,19 @@ class Reading:
         depth_m, other_m, error = maps["log_ratio_near"], maps["log_ratio_far"], maps["log_scale"]
         focus_m, temperature = np.float32(camera.focus_distance_m), np.float32(manifest.temperature)
         floor = thin_lens.depth_error(1.0, camera.focus_distance_m, camera.k_cam_px, LEAST_BLUR_ERROR_PX)
+        infinitely_far_px = thin_lens.blur_from_defocus(camera.k_cam_px, camera.gamma_px)
         nearest, farthest = manifest.ranges.depth_ratio
         scale = camera.image_width_px / photograph_size[1]
         if side != "auto":
             p_near.fill(side == "near")
         for rows in bands(blur_px.shape):
-            at_least_px = blur_px[rows] * np.exp(-2 * SIGMA_OF_LAPLACE * np.exp(maps["blur_log_error"][rows]))
-            least_x = thin_lens.relative_defocus_from_blur(at_least_px, camera.gamma_px, camera.k_cam_px)
-            has_far = least_x < 1
-            near_m = np.exp(depth_m[rows]) * focus_m
-            far_m = np.where(has_far, np.exp(other_m[rows]) * focus_m, near_m)
+            at_least_px = blur_px[rows] * exp(-2 * SIGMA_OF_LAPLACE * exp(maps["blur_log_error"][rows]))
+            has_far = at_least_px < infinitely_far_px
+            near_m = exp(depth_m[rows]) * focus_m
+            far_m = np.where(has_far, exp(other_m[rows]) * focus_m, near_m)
             if side != "far":
                 np.copyto(p_near[rows], 1, where=~has_far)
-            own = np.exp(error[rows]) * (SIGMA_OF_LAPLACE * temperature)
+            own = exp(error[rows]) * (SIGMA_OF_LAPLACE * temperature)
             answer_m, deviation, is_far = merged(near_m, far_m, p_near[rows], own)
             least = np.float32(floor) * answer_m
             is_known = (np.fmax(own, least) <= MAX_RELATIVE_ERROR) & (blur_px[rows] <= most_blur_px)
@@ -165,7 +166,12 @@ class DepthMap:
 
     @property
     def valid_fraction(self) -> float:
-        return float(self.valid.mean())
+        return fraction(self.valid)
+
+
+def fraction(where: NDArray[np.bool_]) -> float:
+    """How much of a map that is, counted: NumPy's mean makes numbers of it first."""
+    return np.count_nonzero(where) / where.size
 
 
 def decide(reading: Reading, size: tuple[int, int]) -> tuple[Array, NDArray[np.bool_]]:

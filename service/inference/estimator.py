@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from service.inference.artifact import Interval, Manifest, ModelFolder
 from service.inference.cancellation import Cancellation
 from service.inference.copies import Read, blend
-from service.inference.depth_map import DepthMap, Reading, all_layers, decide
+from service.inference.depth_map import DepthMap, Reading, all_layers, decide, fraction
 from service.inference.known import Clues, KnownDepth, around
 from service.inference.later import Later
 from service.inference.pair import GraphPair, RawMaps, Side, Stopwatch
@@ -140,7 +140,7 @@ class Estimator:
         if part is not None:
             within = part.within(area)
             answer, blur_px = answer.cut(within), within.cells_of(blur_px, size)
-        blurrier = float((blur_px > read.most_blur_px / reading.scale).mean())
+        blurrier = fraction(blur_px > read.most_blur_px / reading.scale)
         told = clues.warnings if clues is not None else ()
         warnings = (*told, *self._warnings(reading, whole=part is None), *_hardness(blurrier, answer.valid_fraction))
         return replace(answer, warnings=warnings)
@@ -187,7 +187,7 @@ class Estimator:
         scales = (working.image_width_px / area.width_px,)
         read = Read(maps, working, area, self.manifest.stride, scales, most_blur_px)
         is_read_better = smaller > 0 and working.k_cam_px * COARSER >= self.manifest.ranges.k_cam_px.low
-        if not is_read_better or float((maps["blur_px"] > strong_px).mean()) <= STRONG_FRACTION:
+        if not is_read_better or fraction(maps["blur_px"] > strong_px) <= STRONG_FRACTION:
             return read
         told = self._read_copies(request, scale * COARSER, smaller - 1)
         with request.stopwatch.stage("correct"):

@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from service.opencv import exp, log
+
 SIGMA_OF_LAPLACE = np.float32(2**0.5)
 LEAST_P_NEAR = 0.35
 
@@ -24,13 +26,13 @@ def merged(near_m: Array, far_m: Array, p_near: Array, error: Array) -> tuple[Ar
     odds = p_near * np.minimum(ratio, (1 - LEAST_P_NEAR) / LEAST_P_NEAR)
     lean = (odds - (1 - p_near)) / (odds + (1 - p_near))
     doubt, side = 1 - lean**2, np.copysign(np.float32(1), lean)
-    half_gap = np.log(ratio) / 2
+    half_gap = log(ratio) / 2
     scale = error / SIGMA_OF_LAPLACE
     # between the peaks the median solves a quadratic equation in exp(pull / scale)
     np.abs(lean, out=lean)
-    root = np.sqrt(lean**2 + doubt * np.exp(-2 * half_gap / scale))
-    pull = scale * np.log((1 + lean) / np.maximum(lean + root, np.finfo(np.float32).tiny))
+    root = np.sqrt(lean**2 + doubt * exp(-2 * half_gap / scale))
+    pull = scale * log((1 + lean) / np.maximum(lean + root, np.finfo(np.float32).tiny))
     probability = 0.5 + side * (p_near - 0.5)
     deviation = np.sqrt(error**2 + probability * pull**2 + (1 - probability) * (2 * half_gap - pull) ** 2)
-    depth_m = near_m * np.exp(half_gap - side * (half_gap - pull))
+    depth_m = near_m * exp(half_gap - side * (half_gap - pull))
     return depth_m, deviation, side < 0

@@ -18,7 +18,7 @@ from service.inference.hypotheses import SIGMA_OF_LAPLACE
 from service.inference.layout import LEAST_DOUBT, add_odds
 from service.inference.part import Part
 from service.inference.resampling import bands
-from service.opencv import cv2
+from service.opencv import cv2, exp, log
 from service.optics import thin_lens
 from service.optics.camera import Camera
 from service.optics.focus import Sighting, fit_focus
@@ -108,14 +108,14 @@ class Clues:
         shrink = max(1.0, max(blur_px.shape) / MOST_CELLS)
         rows, columns = (max(1, round(cells / shrink)) for cells in blur_px.shape)
         coarse = np.asarray(cv2.resize(blur_px, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
-        log_blur = np.log(coarse / np.float32(read.ratio.columns))
+        log_blur = log(coarse / np.float32(read.ratio.columns))
         v, u = read.places(rows, columns)
         reach_px = np.float32(REACH * max(self.camera.image_width_px, self.camera.image_height_px))
         like = np.empty((len(self.known), rows, columns), np.float32)
         for out, point, blur in zip(like, self.known, self.blur_px, strict=True):
             out[:] = ((v - point.v) / reach_px)[:, np.newaxis] ** 2 + ((u - point.u) / reach_px) ** 2
             out += ((log_blur - np.log(blur)) / LIKE_BLUR) ** 2
-        return np.exp(like / -2)
+        return exp(like / -2)
 
     def lean(self, p_near: Array, likeness: Array) -> None:
         """Draw probabilities of being near, of maps that were read by this camera, towards the sides that are known."""
@@ -135,7 +135,7 @@ class Clues:
             for each in (factor, likeness.max(0) ** 2)
         )
         for rows in bands(depth_m.shape):
-            depth_m[rows] *= np.exp(log_factor[rows])
+            depth_m[rows] *= exp(log_factor[rows])
             known = np.sqrt((1 - share[rows]) * error[rows] ** 2 + share[rows] * TAPE_ERROR**2)
             np.copyto(error[rows], known, where=error[rows] <= MAX_RELATIVE_ERROR)
 

@@ -17,7 +17,7 @@ from service.inference.artifact import LAYOUT_MAP, LAYOUT_ODDS, Manifest, ModelF
 from service.inference.cancellation import Cancellation
 from service.inference.layout import add_odds, shrunk
 from service.inference.session import Graph
-from service.opencv import cv2
+from service.opencv import cv2, exp
 from service.optics import thin_lens
 from service.optics.camera import Camera
 
@@ -126,7 +126,7 @@ def _corrected(seen: RawMaps, camera: Camera, side: Side) -> RawMaps:
     """What the depth graph is given: blur with the camera taken out (eq. 6 and 7), and the camera itself."""
     blur_px = seen["blur_px"]
     gamma_px, k_cam_px = camera.gamma_px, camera.k_cam_px
-    relative_error = np.clip(np.exp(seen["blur_log_error"]), *BLUR_ERROR_RANGE).astype(np.float32)
+    relative_error = np.clip(exp(seen["blur_log_error"]), *BLUR_ERROR_RANGE)
     focal_length_px = camera.intrinsics.fx_px if camera.intrinsics else 0.0
     return {
         **{name: value for name, value in seen.items() if name not in ("blur_px", "blur_log_error")},

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Literal
 
-from sqlalchemy import Engine
+from sqlalchemy import BindParameter, Engine, bindparam
 from sqlalchemy.exc import IntegrityError
 from sqlmodel import Session, col, select
 from sqlmodel.sql.expression import Select
@@ -204,7 +204,7 @@ def _require_row(session: Session, owner: str, name: str, expected: Sequence[int
     return row
 
 
-def _all_current(owner: str) -> Select[CameraRow, CameraRevisionRow]:
+def _all_current(owner: str | BindParameter[str]) -> Select[CameraRow, CameraRevisionRow]:
     """The cameras that an owner has, each with its current revision."""
     return (
         select(CameraRow, CameraRevisionRow)
@@ -217,8 +217,12 @@ def _all_current(owner: str) -> Select[CameraRow, CameraRevisionRow]:
     )
 
 
+# building it anew takes as long as asking it, and every photograph asks it
+_CURRENT = _all_current(bindparam("owner")).where(col(CameraRow.name) == bindparam("name"))
+
+
 def _current(session: Session, owner: str, name: str) -> tuple[CameraRow, CameraRevisionRow]:
-    found = session.exec(_all_current(owner).where(col(CameraRow.name) == name)).first() if _is_name(name) else None
+    found = session.exec(_CURRENT, params={"owner": owner, "name": name}).first() if _is_name(name) else None
     if found is None:
         raise _unknown(name)
     return found
