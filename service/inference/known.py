@@ -6,7 +6,7 @@ it is off by in what is near by and as blurred, too.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -59,7 +59,7 @@ def around(known: Sequence[KnownDepth], part: Part | None = None) -> Part:
 
 @dataclass(frozen=True, slots=True)
 class Clues:
-    """What known depths tell: the camera focused where it was, what to know about that, and sides.
+    """What known depths tell: the camera focused where it was and as sharp there, what to know about that, and sides.
 
     ``leanings`` go from -1, surely beyond focus, to 1, surely nearer; ``blur_px`` are in pixels of the photograph;
     ``shift`` is what to add to all log odds of being near.
@@ -93,9 +93,11 @@ class Clues:
             for point, deviations in zip(known, fit.deviations, strict=True)
             if deviations > MOST_DEVIATIONS
         )
+        fitted = replace(camera.focused_at(fit.focus_distance_m), gamma_px=camera.gamma_px * fit.gamma_ratio)
+        sharpness = f"gamma_px taken as {fitted.gamma_px:.3g}, where {camera.gamma_px:.3g} was told"
         return cls(
-            camera.focused_at(fit.focus_distance_m),
-            (told, *doubted),
+            fitted,
+            (told, *([sharpness] if fitted.gamma_px != camera.gamma_px else []), *doubted),
             tuple(known),
             tuple(blur / read.ratio.columns for blur in blur_px),
             leanings,

@@ -1,18 +1,22 @@
-"""Where a lens is focused, from the blur of things whose depth is known."""
+"""Where a lens is focused, and how sharp its pictures are there, from the blur of things whose depth is known."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
+from service.optics import thin_lens
 from service.optics.camera import Camera
 
-# standard deviations of a logarithm: of the focus distance that was told, as by a ring, and the least of a blur read
+# standard deviations of a logarithm: of the focus distance that was told, as by a ring, of the gamma that was told, as
+# no specs do, and the least of a blur read
 TOLD_ERROR = 0.1
+TOLD_GAMMA_ERROR = 0.3
 READING_ERROR = 0.1
 # Cauchy's loss: what is off by more deviations than this counts ever less, so that one thing mistaken does not decide,
 # be it what was told
 TAIL = 2.5
-FARTHEST_OFF, CANDIDATES = 2.5, 601
+FARTHEST_OFF, CANDIDATES, GAMMA_CANDIDATES = 2.5, 201, 13
 LEAST_BLUR_PX = 0.1
 CONFIDENCE_95 = 1.92  # half of the 95 % quantile of chi squared with one degree of freedom
 
@@ -28,46 +32,64 @@ class Sighting:
 
 @dataclass(frozen=True, slots=True)
 class FocusFit:
-    """The likeliest focus distance in metres, its 95 % interval, and by how many deviations each sighting is off it."""
+    """The likeliest focus distance in metres with its 95 % interval, and gamma over what was told of it.
+
+    ``deviations`` say by how many of its own each sighting is off both.
+    """
 
     focus_distance_m: float
     low_m: float
     high_m: float
+    gamma_ratio: float
     deviations: tuple[float, ...]
 
 
 def fit_focus(camera: Camera, sightings: Sequence[Sighting]) -> FocusFit:
-    """The focus distance whose blur (eq. 3 and 5) is nearest to what was read, and near to the camera's own.
+    """The focus distance and gamma whose blur (eq. 3 and 5) is nearest to what was read, and near to the camera's own.
 
     Blur is in pixels of the camera's pictures. A known depth tells its side of focus, so that, other than depth from
-    blur, this has one answer; from a single sighting close to focus the interval holds both. Its ends are no farther
-    from the camera's focus distance than 2.5 times. Raises ``ValueError`` without a sighting.
+    blur, this has one answer; from a single sighting close to focus the interval holds both. Neither is farther from
+    the camera's own than 2.5 times. Raises ``ValueError`` without a sighting.
     """
     if not sightings:
         raise ValueError("a focus distance is fitted to one known depth or more")
     nearest_m = camera.focal_length_m or 0.0
-    factors = (FARTHEST_OFF ** (2 * place / (CANDIDATES - 1) - 1) for place in range(CANDIDATES))
-    distances_m = [m for m in (camera.focus_distance_m * factor for factor in factors) if m > nearest_m]
-    deviations = [_deviations(camera.focused_at(focus_m), sightings) for focus_m in distances_m]
-    losses = [
-        sum(map(_loss, (math.log(focus_m / camera.focus_distance_m) / TOLD_ERROR, *offs)))
-        for focus_m, offs in zip(distances_m, deviations, strict=True)
-    ]
-    best = losses.index(min(losses))
-    likely_m = [m for m, loss in zip(distances_m, losses, strict=True) if loss <= losses[best] + CONFIDENCE_95]
-    return FocusFit(distances_m[best], likely_m[0], likely_m[-1], deviations[best])
+    distances_m = [m for m in (camera.focus_distance_m * factor for factor in _factors(CANDIDATES)) if m > nearest_m]
+    candidates = [each for focus_m in distances_m for each in _candidates(camera, focus_m, sightings)]
+    best = min(candidates, key=lambda each: each.loss)
+    likely_m = [each.focus_distance_m for each in candidates if each.loss <= best.loss + CONFIDENCE_95]
+    return FocusFit(best.focus_distance_m, likely_m[0], likely_m[-1], best.gamma_ratio, best.deviations)
+
+
+class _Candidate(NamedTuple):
+    focus_distance_m: float
+    gamma_ratio: float
+    deviations: tuple[float, ...]
+    loss: float
+
+
+def _factors(count: int) -> list[float]:
+    """From the least to the most that a candidate may be of what was told, 1 in the middle."""
+    return [FARTHEST_OFF ** (2 * place / (count - 1) - 1) for place in range(count)]
+
+
+def _candidates(camera: Camera, focus_m: float, sightings: Sequence[Sighting]) -> Iterator[_Candidate]:
+    """The camera focused there with every gamma."""
+    k_cam_px = camera.focused_at(focus_m).k_cam_px
+    defocus_px = [thin_lens.defocus_at_depth(seen.depth_m, focus_m, k_cam_px) for seen in sightings]
+    off_focus = math.log(focus_m / camera.focus_distance_m) / TOLD_ERROR
+    for ratio in _factors(GAMMA_CANDIDATES):
+        shown_px = (thin_lens.blur_from_defocus(sigma, camera.gamma_px * ratio) for sigma in defocus_px)
+        deviations = tuple(map(_deviation, sightings, shown_px))
+        off_gamma = math.log(ratio) / TOLD_GAMMA_ERROR
+        yield _Candidate(focus_m, ratio, deviations, sum(map(_loss, (off_focus, *deviations))) + off_gamma**2 / 2)
 
 
 def _loss(deviations: float) -> float:
     return TAIL**2 / 2 * math.log1p((deviations / TAIL) ** 2)
 
 
-def _deviations(camera: Camera, sightings: Sequence[Sighting]) -> tuple[float, ...]:
-    """By how many standard deviations of its reading each blur is off the camera's, in ln lambda."""
-
-    def off(seen: Sighting) -> float:
-        shown_px = camera.blur_px(seen.depth_m)
-        ratio = max(seen.blur_px, LEAST_BLUR_PX) / max(shown_px, LEAST_BLUR_PX)
-        return abs(math.log(ratio)) / max(seen.error, READING_ERROR)
-
-    return tuple(map(off, sightings))
+def _deviation(seen: Sighting, shown_px: float) -> float:
+    """By how many standard deviations of its reading a blur is off what the camera shows, in ln lambda."""
+    ratio = max(seen.blur_px, LEAST_BLUR_PX) / max(shown_px, LEAST_BLUR_PX)
+    return abs(math.log(ratio)) / max(seen.error, READING_ERROR)

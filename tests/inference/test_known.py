@@ -55,6 +55,17 @@ def test_the_answer_is_by_the_camera_focused_where_known_depths_say(estimator: E
     assert "where 2 m was told" in corrected.warnings[0]
 
 
+def test_a_gamma_that_was_told_wrongly_follows_too(estimator: Estimator) -> None:
+    blurry = replace(TRUE, gamma_px=1.0)
+    picture = photograph()
+    picture[100:200, 250:384] = brightness_for(blurry.blur_px(TRUE.focus_distance_m))
+    known = (*KNOWN, KnownDepth(320, 150, TRUE.focus_distance_m))
+    answer = estimator.estimate(picture, TOLD, known=known)
+    assert answer.camera.gamma_px == pytest.approx(1.0, rel=0.15)
+    assert answer.camera.focus_distance_m == pytest.approx(1.8, rel=0.05)
+    assert any("where 0.5 was told" in warning for warning in answer.warnings)
+
+
 def test_a_side_that_is_known_is_that_of_what_is_like_it_and_near_by(estimator: Estimator) -> None:
     answer = estimator.estimate(photograph(red=EVENLY), TOLD, known=KNOWN)
     near, far = answer.depth_m[110:130, 50:70], answer.depth_m[30:50, 320:340]

@@ -31,6 +31,21 @@ def test_things_near_and_far_tell_the_focus_distance(
     assert max(fit.deviations) < 1
 
 
+@pytest.mark.parametrize("gamma_px", [0.35, 0.5, 0.8, 1.1])
+def test_what_is_in_focus_tells_gamma_and_what_is_not_the_focus_distance(gamma_px: float) -> None:
+    true = replace(CAMERA.focused_at(1.9), gamma_px=gamma_px)
+    fit = fit_focus(CAMERA, [Sighting(depth_m, true.blur_px(depth_m), EXACT) for depth_m in (1.0, 1.9, 4.0)])
+    assert fit.gamma_ratio * CAMERA.gamma_px == pytest.approx(gamma_px, rel=0.13)
+    assert fit.focus_distance_m == pytest.approx(1.9, rel=0.03)
+    assert max(fit.deviations) < 2
+
+
+def test_things_out_of_focus_tell_no_gamma() -> None:
+    true = replace(CAMERA, gamma_px=0.8)
+    fit = fit_focus(CAMERA, [Sighting(depth_m, true.blur_px(depth_m), EXACT) for depth_m in (0.5, 0.8)])
+    assert fit.gamma_ratio == 1
+
+
 def test_one_thing_tells_it_less_surely_than_three() -> None:
     one, three = fitted(1.8, 1.2), fitted(1.8, 1.0, 1.2, 3.0)
     assert abs(three.focus_distance_m - 1.8) < abs(one.focus_distance_m - 1.8) < 0.2
