@@ -65,7 +65,7 @@ class DepthQuery(BaseModel):
         tuple[Known, ...],
         Field(
             max_length=MAX_KNOWN,
-            description="Known depths u,v,depth_m, repeatable: the focus distance is fitted to them, near the one told",
+            description="Known depths u,v,depth_m, repeatable: focus distance and gamma are fitted to them",
         ),
     ] = ()
 
