@@ -1,4 +1,4 @@
-"""Depths that somebody knows, by a tape: from them follows what no picture shows, where its lens was focused.
+"""Depths that somebody knows, by a tape: from them follows what no picture shows, where its lens was focused and gamma.
 
 So does on which side of focus things are: there where depth is known, in what is near by and as blurred, and, as a
 network that errs about one thing's side errs about others', a little everywhere. What depth is off by where it is known
@@ -82,22 +82,23 @@ class Clues:
         errors = np.exp(log_error) * SIGMA_OF_LAPLACE
         seen = [Sighting(*each) for each in zip((point.depth_m for point in known), blur_px, errors, strict=True)]
         fit = fit_focus(read.camera, seen)
+        fitted = replace(camera.focused_at(fit.focus_distance_m), gamma_px=camera.gamma_px * fit.gamma_ratio)
         defocus = [thin_lens.signed_defocus(point.depth_m, fit.focus_distance_m) for point in known]
         leanings = tuple(max(-1.0, min(1.0, -x / SURELY_OUT)) for x in defocus)
-        told = (
+        told = [
             f"focused at {fit.focus_distance_m:.3g} m ({fit.low_m:.3g} to {fit.high_m:.3g}), where "
             f"{camera.focus_distance_m:.4g} m was told, by what is known of the depth"
-        )
-        doubted = (
+        ]
+        if fit.gamma_ratio != 1:
+            told.append(f"gamma_px taken as {fitted.gamma_px:.3g}, where {camera.gamma_px:.3g} was told")
+        told += (
             f"its blur speaks against the known depth of {point.depth_m:g} m at {point.u:g},{point.v:g}"
             for point, deviations in zip(known, fit.deviations, strict=True)
             if deviations > MOST_DEVIATIONS
         )
-        fitted = replace(camera.focused_at(fit.focus_distance_m), gamma_px=camera.gamma_px * fit.gamma_ratio)
-        sharpness = f"gamma_px taken as {fitted.gamma_px:.3g}, where {camera.gamma_px:.3g} was told"
         return cls(
             fitted,
-            (told, *([sharpness] if fitted.gamma_px != camera.gamma_px else []), *doubted),
+            tuple(told),
             tuple(known),
             tuple(blur / read.ratio.columns for blur in blur_px),
             leanings,

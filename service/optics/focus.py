@@ -16,7 +16,10 @@ READING_ERROR = 0.1
 # Cauchy's loss: what is off by more deviations than this counts ever less, so that one thing mistaken does not decide,
 # be it what was told
 TAIL = 2.5
-FARTHEST_OFF, CANDIDATES, GAMMA_CANDIDATES = 2.5, 201, 13
+FARTHEST_OFF = 2.5
+# candidates over what was told
+FOCUS_RATIOS = tuple(FARTHEST_OFF ** (step / 100) for step in range(-100, 101))
+GAMMA_RATIOS = tuple(FARTHEST_OFF ** (step / 6) for step in range(-6, 7))
 LEAST_BLUR_PX = 0.1
 CONFIDENCE_95 = 1.92  # half of the 95 % quantile of chi squared with one degree of freedom
 
@@ -54,7 +57,7 @@ def fit_focus(camera: Camera, sightings: Sequence[Sighting]) -> FocusFit:
     if not sightings:
         raise ValueError("a focus distance is fitted to one known depth or more")
     nearest_m = camera.focal_length_m or 0.0
-    distances_m = [m for m in (camera.focus_distance_m * factor for factor in _factors(CANDIDATES)) if m > nearest_m]
+    distances_m = [m for m in (camera.focus_distance_m * ratio for ratio in FOCUS_RATIOS) if m > nearest_m]
     candidates = [each for focus_m in distances_m for each in _candidates(camera, focus_m, sightings)]
     best = min(candidates, key=lambda each: each.loss)
     likely_m = [each.focus_distance_m for each in candidates if each.loss <= best.loss + CONFIDENCE_95]
@@ -68,17 +71,12 @@ class _Candidate(NamedTuple):
     loss: float
 
 
-def _factors(count: int) -> list[float]:
-    """From the least to the most that a candidate may be of what was told, 1 in the middle."""
-    return [FARTHEST_OFF ** (2 * place / (count - 1) - 1) for place in range(count)]
-
-
 def _candidates(camera: Camera, focus_m: float, sightings: Sequence[Sighting]) -> Iterator[_Candidate]:
     """The camera focused there with every gamma."""
     k_cam_px = camera.focused_at(focus_m).k_cam_px
     defocus_px = [thin_lens.defocus_at_depth(seen.depth_m, focus_m, k_cam_px) for seen in sightings]
     off_focus = math.log(focus_m / camera.focus_distance_m) / TOLD_ERROR
-    for ratio in _factors(GAMMA_CANDIDATES):
+    for ratio in GAMMA_RATIOS:
         shown_px = (thin_lens.blur_from_defocus(sigma, camera.gamma_px * ratio) for sigma in defocus_px)
         deviations = tuple(map(_deviation, sightings, shown_px))
         off_gamma = math.log(ratio) / TOLD_GAMMA_ERROR
