@@ -42,7 +42,7 @@ TEXTURED_SHARE = 0.6
 SIDES: dict[int, Side] = {-1: "near", 0: "auto", 1: "far"}
 FIXED = "fixed"
 FIXED_SCENES = 6
-ORACLE_FACTORS = (0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.4, 1.6)
+ORACLE_FACTORS = (0.8, 0.9, 1.0, 1.1, 1.25, 1.4)
 MISFOCUSED = ("focus -10%", "focus +10%")
 KNOWN_DEPTHS = ", known depths"  # after the name of another mode: three depths of each picture are known besides
 KNOWN_RANKS = (1 / 6, 3 / 6, 5 / 6)
@@ -300,8 +300,8 @@ def _indoor_trials(folder: Path, quick: bool) -> list[Trial]:
         further = ("estimated k_cam", "no k_cam", *misled)
         count = many if camera == REFERENCE else several
         found.append(_trial(f"{folder.name} k_cam {k_cam_px:g}", by(camera, count), *further))
-    found.append(_trial(f"{folder.name} in focus", partial(sharp_cases, folder, several)))
-    found.append(_trial(f"{folder.name} shuffled", partial(shuffled_cases, folder, several)))
+    found.append(_trial(f"{folder.name} in focus", partial(sharp_cases, folder, few)))
+    found.append(_trial(f"{folder.name} shuffled", partial(shuffled_cases, folder, few)))
     for view in VIEWS:
         found += [_trial(f"{folder.name} view {view:g}", partial(viewed_cases, folder, several, view))]
     if quick:

@@ -50,6 +50,11 @@ class PointSpread:
     angle: float = 0.0
     chromatic_px: tuple[float, float] = (0.0, 0.0)
 
+    def reach_px(self, sigma_px: float) -> float:
+        """How far from its middle one of this standard deviation has light: its disc's longer half, and the softness."""
+        of_gauss, longer_px = Spreads.of([self]).parts(np.array([sigma_px**2]))
+        return float(longer_px[0] + MARGIN_SIGMAS * math.sqrt(of_gauss[0]))
+
 
 GAUSSIAN = PointSpread()
 DISC = PointSpread(1.0)
@@ -106,6 +111,11 @@ class Spreads:
         """Those of some items, in their order."""
         return Spreads(self.disc_share[items], self.squeeze[items], self.angle[items])
 
+    def parts(self, variance: Numbers) -> tuple[Numbers, Numbers]:
+        """Of point spreads with this variance per axis [n]: that of their Gaussian, and half their disc's longer axis."""
+        of_gauss = np.maximum((1 - self.disc_share) * variance, np.minimum(variance, SOFT_EDGE_VARIANCE))
+        return of_gauss, 2 * np.sqrt(np.maximum(variance - of_gauss, 0) * 2 / (1 + self.squeeze**2))
+
 
 def transfers(height: int, width: int, sigma_px: Numbers, spreads: Spreads, device: torch.device) -> Tensor:
     """Transfer functions [n,h,w//2+1] of point spreads with these standard deviations per axis [n].
@@ -113,9 +123,7 @@ def transfers(height: int, width: int, sigma_px: Numbers, spreads: Spreads, devi
     The Gaussians are sampled ones: positive and of exact variance at any sigma, where a band-limited one of half a
     pixel rings.
     """
-    variance = sigma_px**2
-    of_gauss = np.maximum((1 - spreads.disc_share) * variance, np.minimum(variance, SOFT_EDGE_VARIANCE))
-    longer_px = 2 * np.sqrt(np.maximum(variance - of_gauss, 0) * 2 / (1 + spreads.squeeze**2))
+    of_gauss, longer_px = spreads.parts(sigma_px**2)
     told = (of_gauss, of_gauss < SAMPLED_BELOW_VARIANCE, longer_px, np.cos(spreads.angle), np.sin(spreads.angle))
     gauss, narrow, longer, cos, sin, squeeze = columns(device, *told, spreads.squeeze)
     taps = sent(sampled_taps(of_gauss).astype(np.float32), device)
@@ -313,7 +321,7 @@ def refocus(
     """
     signed = thin_lens.signed_defocus(depth_m, camera.focus_distance_m) * camera.k_cam_px
     sigma = thin_lens.defocus_at_depth(depth_m, camera.focus_distance_m, camera.k_cam_px)
-    margin = math.ceil(MARGIN_SIGMAS * (float(sigma.max()) + camera.gamma_px)) + 1
+    margin = math.ceil(spread.reach_px(float(sigma.max())) + GAUSSIAN.reach_px(camera.gamma_px)) + 1
     margin = min(margin, min(depth_m.shape) - 1)
     height, width = depth_m.shape
     pad = tuple((margin, cv2.getOptimalDFTSize(size + 2 * margin) - size - margin) for size in (height, width))
@@ -326,7 +334,7 @@ def refocus(
     reach = 0
     for number, level in enumerate(levels):
         # what is hidden may be seen as far as anything nearer is blurred
-        reach = max(reach, math.ceil(MARGIN_SIGMAS * (level + math.sqrt(SOFT_EDGE_VARIANCE))))
+        reach = max(reach, math.ceil(spread.reach_px(level)))
         shown, lit = index <= number, clear[0].abs().numpy() > UNSEEN
         if not lit.any():
             break
