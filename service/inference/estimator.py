@@ -121,7 +121,7 @@ class Estimator:
         read = self._read_copies(request, self._base_scale(request.camera))
         area, stopwatch = read.area, request.stopwatch
         size = (area.height_px, area.width_px)
-        reading = self._reading(request, read, clues)
+        reading, told = self._reading(request, read, clues)
         if area.height_px * area.width_px > SMALL_PX:
             self._freeing.ask()  # what a large picture has taken is kept for the next one, but for a while only
         request.cancellation.check()
@@ -141,7 +141,6 @@ class Estimator:
             within = part.within(area)
             answer, blur_px = answer.cut(within), within.cells_of(blur_px, size)
         blurrier = fraction(blur_px > read.most_blur_px / reading.scale)
-        told = clues.warnings if clues is not None else ()
         warnings = (*told, *self._warnings(reading, whole=part is None), *_hardness(blurrier, answer.valid_fraction))
         return replace(answer, warnings=warnings)
 
@@ -155,21 +154,21 @@ class Estimator:
             return None
         read = self._read_copies(replace(request, side="auto", part=around(known)), self._base_scale(request.camera))
         with request.stopwatch.stage("correct"):
-            return Clues.of(read, request.camera, known)
+            return Clues.of(read, request.camera, request.side, known)
 
-    def _reading(self, request: _Request, read: Read, clues: Clues | None) -> Reading:
-        """What the networks' maps, which are written over, and known depths say together."""
+    def _reading(self, request: _Request, read: Read, clues: Clues | None) -> tuple[Reading, tuple[str, ...]]:
+        """What the networks' maps, which are written over, and known depths say together, and what to know of those."""
         size = (read.area.height_px, read.area.width_px)
         reading = partial(Reading.of, read.maps, read.camera, size, self.manifest, request.side, read.most_blur_px)
         if clues is None:
-            return reading()
+            return reading(), ()
         with request.stopwatch.stage("correct"):
             likeness = clues.likeness(read)
             if request.side == "auto":
-                clues.lean(read.maps["p_near"], likeness)
+                clues.lean(read, likeness)
             told = reading()
-            clues.anchor(told, read, likeness)
-        return told
+            unmet = clues.anchor(told, read, likeness)
+        return told, (*clues.warnings, *unmet)
 
     def _base_scale(self, camera: Camera) -> float:
         """The largest copy whose k_cam the model reads well, or a smaller one of a large picture; never enlarged."""

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.inference.copies import Read
-from service.inference.depth_map import MAX_RELATIVE_ERROR, Reading
+from service.inference.depth_map import MAX_RELATIVE_ERROR, MOST_STATED, Reading
 from service.inference.hypotheses import SIGMA_OF_LAPLACE
 from service.inference.layout import LEAST_DOUBT, add_odds
+from service.inference.pair import Side
 from service.inference.part import Part
 from service.inference.resampling import bands
 from service.opencv import cv2, exp, log
@@ -32,10 +33,12 @@ REACH = 0.1  # of the longer side: standard deviation of what is near by
 LIKE_BLUR = 0.3  # standard deviation of ln lambda of what is as blurred
 TAPE_ERROR = np.float32(0.02)
 MOST_ANCHORED = float(np.log(2))
+MUCH_OFF = 0.1
 MOST_CELLS = 320
 SHIFTS = np.linspace(-8, 8, 321)
 
 Array = NDArray[np.float32]
+Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,10 +65,11 @@ class Clues:
     """What known depths tell: the camera focused where it was and as sharp there, what to know about that, and sides.
 
     ``leanings`` go from -1, surely beyond focus, to 1, surely nearer; ``blur_px`` are in pixels of the photograph;
-    ``shift`` is what to add to all log odds of being near.
+    ``shift`` is what to add to all log odds of being near, where no ``side`` was asked for.
     """
 
     camera: Camera
+    side: Side
     warnings: tuple[str, ...]
     known: tuple[KnownDepth, ...]
     blur_px: tuple[float, ...]
@@ -73,7 +77,7 @@ class Clues:
     shift: float
 
     @classmethod
-    def of(cls, read: Read, camera: Camera, known: Sequence[KnownDepth]) -> Self:
+    def of(cls, read: Read, camera: Camera, side: Side, known: Sequence[KnownDepth]) -> Self:
         """From what the networks say, by the camera as it was told, of an area that holds all known depths."""
         cells = [read.cell_of(point.u, point.v) for point in known]
         blur_px, log_error, p_near = (
@@ -81,7 +85,7 @@ class Clues:
         )
         errors = np.exp(log_error) * SIGMA_OF_LAPLACE
         seen = [Sighting(*each) for each in zip((point.depth_m for point in known), blur_px, errors, strict=True)]
-        fit = fit_focus(read.camera, seen)
+        fit = fit_focus(read.camera, seen, None if side == "auto" else side == "near")
         fitted = replace(camera.focused_at(fit.focus_distance_m), gamma_px=camera.gamma_px * fit.gamma_ratio)
         defocus = [thin_lens.signed_defocus(point.depth_m, fit.focus_distance_m) for point in known]
         leanings = tuple(max(-1.0, min(1.0, -x / SURELY_OUT)) for x in defocus)
@@ -98,6 +102,7 @@ class Clues:
         )
         return cls(
             fitted,
+            side,
             tuple(told),
             tuple(known),
             tuple(blur / read.ratio.columns for blur in blur_px),
@@ -120,38 +125,69 @@ class Clues:
             out += ((log_blur - np.log(blur)) / LIKE_BLUR) ** 2
         return exp(like / -2)
 
-    def lean(self, p_near: Array, likeness: Array) -> None:
-        """Draw probabilities of being near, of maps that were read by this camera, towards the sides that are known."""
-        add_odds(p_near, self.shift + OWN_ODDS * _spread(self.leanings, likeness), p_near.shape)
+    def lean(self, read: Read, likeness: Array) -> None:
+        """Draw maps' probabilities of being near, as this camera has them, towards the sides that are known."""
+        p_near = read.maps["p_near"]
+        odds = _log_odds(np.array([p_near[read.cell_of(point.u, point.v)] for point in self.known])) + self.shift
+        leanings = np.array(self.leanings)
+        # where depth is known, so is its side, whatever the picture looks like
+        own = np.maximum(OWN_ODDS, OWN_ODDS - np.sign(leanings) * odds)
+        add_odds(p_near, self.shift + _spread(leanings * own, likeness), p_near.shape)
 
-    def anchor(self, reading: Reading, read: Read, likeness: Array) -> None:
+    def anchor(self, reading: Reading, read: Read, likeness: Array) -> list[str]:
         """Take what depth is off by where it is known, as a factor, from what is like it and near by.
 
-        As far as that is so, a stated error is the tape's.
+        As far as that is so, a stated error is the tape's and that by which the answer still is off what is known: a
+        warning each where that is much. No answer leaves the side that was asked for.
         """
-        depth_m, error = reading.depth_m, reading.error
-        off = [np.log(point.depth_m / depth_m[read.cell_of(point.u, point.v)]) for point in self.known]
-        factor = _spread([max(-MOST_ANCHORED, min(MOST_ANCHORED, float(each))) for each in off], likeness)
+        depth_m, error, focus_m = reading.depth_m, reading.error, self.camera.focus_distance_m
+        low_m, high_m = {"near": (0.0, focus_m), "far": (focus_m, np.inf), "auto": (0.0, np.inf)}[self.side]
+        cells = [read.cell_of(point.u, point.v) for point in self.known]
+
+        def off() -> Numbers:
+            return np.log([point.depth_m / float(depth_m[cell]) for point, cell in zip(self.known, cells, strict=True)])
+
+        factor = np.clip(np.where(self._is_possible(), off(), 0), -MOST_ANCHORED, MOST_ANCHORED)
         size = depth_m.shape[::-1]
-        log_factor, share = (
-            np.asarray(cv2.resize(each, size, interpolation=cv2.INTER_LINEAR), np.float32)
-            for each in (factor, likeness.max(0) ** 2)
-        )
+        log_factor = _enlarged(_spread(factor, likeness), size)
         for rows in bands(depth_m.shape):
-            depth_m[rows] *= exp(log_factor[rows])
-            known = np.sqrt((1 - share[rows]) * error[rows] ** 2 + share[rows] * TAPE_ERROR**2)
-            np.copyto(error[rows], known, where=error[rows] <= MAX_RELATIVE_ERROR)
+            depth_m[rows] = (depth_m[rows] * exp(log_factor[rows])).clip(low_m, high_m)
+        still_off = off()
+        own_error = _enlarged(_spread(still_off**2, likeness) + TAPE_ERROR**2, size)
+        share = _enlarged(likeness.max(0) ** 2, size)
+        for rows in bands(depth_m.shape):
+            known = np.sqrt((1 - share[rows]) * error[rows] ** 2 + share[rows] * own_error[rows])
+            np.copyto(error[rows], np.minimum(known, MOST_STATED), where=error[rows] <= MAX_RELATIVE_ERROR)
+        return [
+            f"{depth_m[cell]:.3g} m is answered at {point.u:g},{point.v:g} for the known depth of {point.depth_m:g} m"
+            for point, cell, by in zip(self.known, cells, still_off, strict=True)
+            if abs(by) > MUCH_OFF and error[cell] <= MAX_RELATIVE_ERROR
+        ]
+
+    def _is_possible(self) -> NDArray[np.bool_]:
+        """Which known depths are not surely on the side of focus that was not asked for."""
+        other_side = {"near": -1.0, "far": 1.0, "auto": None}[self.side]
+        return np.array([leaning != other_side for leaning in self.leanings])
 
 
-def _spread(values: Sequence[float], likeness: Array) -> Array:
+def _enlarged(values: Array, size: tuple[int, int]) -> Array:
+    """A map made as large as (width, height)."""
+    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_LINEAR), np.float32)
+
+
+def _log_odds(p_near: Numbers) -> Numbers:
+    kept = np.clip(p_near, LEAST_DOUBT, 1 - LEAST_DOUBT)
+    return np.asarray(np.log(kept / (1 - kept)))
+
+
+def _spread(values: Numbers, likeness: Array) -> Array:
     """A map of values that are known in places: theirs there, their mean where several count, 0 far from all."""
-    given = np.tensordot(np.array(values, np.float32), likeness, 1)
+    given = np.tensordot(values.astype(np.float32), likeness, 1)
     return np.asarray(given / np.maximum(likeness.sum(0), 1), np.float32)
 
 
-def _shift(p_near: NDArray[np.float64], leanings: NDArray[np.float64]) -> float:
+def _shift(p_near: Numbers, leanings: Numbers) -> float:
     """The likeliest shift of all log odds, where each known side counts as far as it is sure."""
-    kept = np.clip(p_near, LEAST_DOUBT, 1 - LEAST_DOUBT)
-    odds = np.log(kept / (1 - kept)) + SHIFTS[:, np.newaxis]
+    odds = _log_odds(p_near) + SHIFTS[:, np.newaxis]
     loss = (np.abs(leanings) * np.logaddexp(0, -np.sign(leanings) * odds)).sum(1) + (SHIFTS / SHARED_ODDS) ** 2 / 2
     return float(SHIFTS[loss.argmin()])

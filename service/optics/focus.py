@@ -9,10 +9,11 @@ from service.optics import thin_lens
 from service.optics.camera import Camera
 
 # standard deviations of a logarithm: of the focus distance that was told, as by a ring, of the gamma that was told, as
-# no specs do, and the least of a blur read
+# no specs do, the least of a blur read, and of where focus lies between what was said to be nearer and beyond
 TOLD_ERROR = 0.1
 TOLD_GAMMA_ERROR = 0.3
 READING_ERROR = 0.1
+SIDE_ERROR = 0.05
 # Cauchy's loss: what is off by more deviations than this counts ever less, so that one thing mistaken does not decide,
 # be it what was told
 TAIL = 2.5
@@ -47,18 +48,19 @@ class FocusFit:
     deviations: tuple[float, ...]
 
 
-def fit_focus(camera: Camera, sightings: Sequence[Sighting]) -> FocusFit:
+def fit_focus(camera: Camera, sightings: Sequence[Sighting], is_near: bool | None = None) -> FocusFit:
     """The focus distance and gamma whose blur (eq. 3 and 5) is nearest to what was read, and near to the camera's own.
 
     Blur is in pixels of the camera's pictures. A known depth tells its side of focus, so that, other than depth from
-    blur, this has one answer; from a single sighting close to focus the interval holds both. Neither is farther from
-    the camera's own than 2.5 times. Raises ``ValueError`` without a sighting.
+    blur, this has one answer; from a single sighting close to focus the interval holds both, unless it is told whether
+    all of the picture ``is_near``, nearer than what is in focus, or beyond it. Neither is farther from the camera's own
+    than 2.5 times. Raises ``ValueError`` without a sighting.
     """
     if not sightings:
         raise ValueError("a focus distance is fitted to one known depth or more")
     nearest_m = camera.focal_length_m or 0.0
     distances_m = [m for m in (camera.focus_distance_m * ratio for ratio in FOCUS_RATIOS) if m > nearest_m]
-    candidates = [each for focus_m in distances_m for each in _candidates(camera, focus_m, sightings)]
+    candidates = [each for focus_m in distances_m for each in _candidates(camera, focus_m, sightings, is_near)]
     best = min(candidates, key=lambda each: each.loss)
     likely_m = [each.focus_distance_m for each in candidates if each.loss <= best.loss + CONFIDENCE_95]
     return FocusFit(best.focus_distance_m, likely_m[0], likely_m[-1], best.gamma_ratio, best.deviations)
@@ -71,16 +73,27 @@ class _Candidate(NamedTuple):
     loss: float
 
 
-def _candidates(camera: Camera, focus_m: float, sightings: Sequence[Sighting]) -> Iterator[_Candidate]:
+def _candidates(
+    camera: Camera, focus_m: float, sightings: Sequence[Sighting], is_near: bool | None
+) -> Iterator[_Candidate]:
     """The camera focused there with every gamma."""
     k_cam_px = camera.focused_at(focus_m).k_cam_px
     defocus_px = [thin_lens.defocus_at_depth(seen.depth_m, focus_m, k_cam_px) for seen in sightings]
     off_focus = math.log(focus_m / camera.focus_distance_m) / TOLD_ERROR
+    off_sides = [_off_side(seen.depth_m, focus_m, is_near) for seen in sightings]
     for ratio in GAMMA_RATIOS:
         shown_px = (thin_lens.blur_from_defocus(sigma, camera.gamma_px * ratio) for sigma in defocus_px)
         deviations = tuple(map(_deviation, sightings, shown_px))
         off_gamma = math.log(ratio) / TOLD_GAMMA_ERROR
-        yield _Candidate(focus_m, ratio, deviations, sum(map(_loss, (off_focus, *deviations))) + off_gamma**2 / 2)
+        yield _Candidate(
+            focus_m, ratio, deviations, sum(map(_loss, (off_focus, *off_sides, *deviations))) + off_gamma**2 / 2
+        )
+
+
+def _off_side(depth_m: float, focus_m: float, is_near: bool | None) -> float:
+    """By how many standard deviations a thing is on the side of focus where nothing was said to be."""
+    beyond = math.log(depth_m / focus_m) / SIDE_ERROR
+    return 0.0 if is_near is None else max(0.0, beyond if is_near else -beyond)
 
 
 def _loss(deviations: float) -> float:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from service.inference.artifact import load_model_folder
 from service.inference.estimator import Estimator
 from service.inference.known import KnownDepth
+from service.inference.pair import Side
 from service.inference.part import Part
 from service.optics.camera import Camera
 from tests.inference.oracle_pair import brightness_for, build_oracle_pair
@@ -45,7 +46,8 @@ def photograph(red: int | None = None) -> NDArray[np.uint8]:
 
 
 def test_the_answer_is_by_the_camera_focused_where_known_depths_say(estimator: Estimator) -> None:
-    told, corrected = (estimator.estimate(photograph(), TOLD, "near", known=known) for known in ((), KNOWN))
+    told = estimator.estimate(photograph(), TOLD, "near")
+    corrected = estimator.estimate(photograph(), TOLD, known=KNOWN)
     assert corrected.camera.focus_distance_m == pytest.approx(1.8, rel=0.03)
     assert corrected.camera.k_cam_px == pytest.approx(TRUE.k_cam_px, rel=0.03)
     assert told.depth_m[120, 60] > 1.05 * LEFT_M
@@ -117,19 +119,44 @@ def test_an_error_is_the_tapes_where_depth_is_known_and_the_models_far_from_ther
 
 
 def test_no_known_depth_moves_an_answer_to_more_than_twice_or_half(estimator: Estimator) -> None:
-    known = (*KNOWN, KnownDepth(61, 121, LEFT_M), KnownDepth(20, 20, 50.0))
-    depth_m = estimator.estimate(photograph(), TOLD, "near", known=known).depth_m
-    assert depth_m[20, 20] == pytest.approx(2 * LEFT_M, rel=0.05)
+    known = (*KNOWN, KnownDepth(61, 121, LEFT_M), KnownDepth(20, 20, 0.2))
+    answer = estimator.estimate(photograph(), TOLD, "near", known=known)
+    assert answer.depth_m[20, 20] == pytest.approx(LEFT_M / 2, rel=0.05)
+    assert answer.sigma_m[20, 20] / answer.depth_m[20, 20] > np.log(2)
+    assert any("for the known depth of 0.2 m" in warning for warning in answer.warnings)
 
 
-def test_a_side_that_is_asked_for_stays(estimator: Estimator) -> None:
-    answer = estimator.estimate(photograph(red=EVENLY), TOLD, "far", known=KNOWN)
-    assert (answer.p_near == 0).all()
+def test_a_known_side_holds_where_the_model_is_sure_of_the_other(estimator: Estimator) -> None:
+    answer = estimator.estimate(photograph(red=1), TOLD, known=KNOWN)
+    assert answer.depth_m[120, 60] == pytest.approx(LEFT_M, rel=0.03)
+    assert answer.p_near[120, 60] > 0.9
+    assert len(answer.warnings) == 1
+
+
+def test_two_depths_of_one_pixel_are_an_error_of_that_much_and_told_of(estimator: Estimator) -> None:
+    known = [*KNOWN, KnownDepth(60, 120, 0.6 * LEFT_M)]
+    answer = estimator.estimate(photograph(), TOLD, "near", known=known)
+    assert 0.6 * LEFT_M < answer.depth_m[120, 60] < LEFT_M
+    assert answer.sigma_m[120, 60] / answer.depth_m[120, 60] > 0.2
+    assert sum("for the known depth" in warning for warning in answer.warnings) == len(known)
+
+
+@pytest.mark.parametrize(("side", "pixel", "depth_m"), [("near", (330, 40), RIGHT_M), ("far", (60, 120), LEFT_M)])
+def test_a_side_that_is_asked_for_stays_and_a_depth_on_the_other_is_told_of(
+    estimator: Estimator, side: Side, pixel: tuple[int, int], depth_m: float
+) -> None:
+    answer = estimator.estimate(photograph(red=EVENLY), TOLD, side, known=KNOWN)
+    u, v = pixel
+    focus_m = answer.camera.focus_distance_m
+    assert (answer.p_near == (side == "near")).all()
+    assert (answer.depth_m <= focus_m).all() if side == "near" else (answer.depth_m >= focus_m).all()
+    assert answer.sigma_m[v, u] > 0.5 * abs(answer.depth_m[v, u] - depth_m)
+    assert any(f"at {u},{v} for the known depth of {depth_m:g} m" in warning for warning in answer.warnings)
 
 
 def test_a_depth_that_blur_speaks_against_is_told_of(estimator: Estimator) -> None:
     known = (*KNOWN, KnownDepth(340, 200, RIGHT_M), KnownDepth(90, 200, 1.7))
-    answer = estimator.estimate(photograph(), TOLD, "near", known=known)
+    answer = estimator.estimate(photograph(), TOLD, known=known)
     assert [warning for warning in answer.warnings if "speaks against" in warning] == [
         "its blur speaks against the known depth of 1.7 m at 90,200"
     ]

@@ -57,6 +57,17 @@ def test_of_one_thing_close_to_focus_either_side_of_it_is_possible() -> None:
     assert fit.low_m < 1.9 < 2.1 < fit.high_m
 
 
+@pytest.mark.parametrize(("is_near", "depth_m", "told_m"), [(True, 1.5, 1.45), (False, 3.0, 3.6)])
+def test_of_one_thing_close_to_focus_that_side_is_taken_on_which_all_was_said_to_be(
+    is_near: bool, depth_m: float, told_m: float
+) -> None:
+    seen = [Sighting(depth_m, CAMERA.blur_px(depth_m), EXACT)]
+    told = CAMERA.focused_at(told_m)
+    fit, without = fit_focus(told, seen, is_near), fit_focus(told, seen)
+    assert fit.focus_distance_m == pytest.approx(2.0, rel=0.2)
+    assert (fit.focus_distance_m > depth_m) == is_near != (without.focus_distance_m > depth_m)
+
+
 def test_a_doubtful_reading_moves_it_less() -> None:
     sure, doubtful = (fitted(1.6, 1.2, error=error).focus_distance_m for error in (0.1, 0.8))
     assert 1.6 < sure < doubtful < 2.0
