@@ -51,7 +51,7 @@ class PointSpread:
     chromatic_px: tuple[float, float] = (0.0, 0.0)
 
     def reach_px(self, sigma_px: float) -> float:
-        """How far from its middle one of this standard deviation has light: its disc's longer half, and the softness."""
+        """How far from its middle one of this standard deviation has light: its disc, and what softens that."""
         of_gauss, longer_px = Spreads.of([self]).parts(np.array([sigma_px**2]))
         return float(longer_px[0] + MARGIN_SIGMAS * math.sqrt(of_gauss[0]))
 
@@ -112,7 +112,7 @@ class Spreads:
         return Spreads(self.disc_share[items], self.squeeze[items], self.angle[items])
 
     def parts(self, variance: Numbers) -> tuple[Numbers, Numbers]:
-        """Of point spreads with this variance per axis [n]: that of their Gaussian, and half their disc's longer axis."""
+        """Of point spreads with this variance per axis [n]: that of their Gaussian, their disc's longer half axis."""
         of_gauss = np.maximum((1 - self.disc_share) * variance, np.minimum(variance, SOFT_EDGE_VARIANCE))
         return of_gauss, 2 * np.sqrt(np.maximum(variance - of_gauss, 0) * 2 / (1 + self.squeeze**2))
 

@@ -57,11 +57,13 @@ class Reading:
         """``photograph_size`` is (height, width). The maps are taken over and written over: they may be large.
 
         Where the side is given its hypothesis is the answer, or nothing where no far one can exist. No error is stated
-        below the floor of optics, and nothing answered of more blur than ``most_blur_px``, in pixels of the copy.
+        below the floor of optics, and nothing answered of more blur than ``most_blur_px``, in pixels of the copy. By a
+        k_cam below those that the model knows errors grow as what blur tells shrinks.
         """
         blur_px, p_near = maps["blur_px"], maps["p_near"]
         depth_m, other_m, error = maps["log_ratio_near"], maps["log_ratio_far"], maps["log_scale"]
-        focus_m, temperature = np.float32(camera.focus_distance_m), np.float32(manifest.temperature)
+        focus_m = np.float32(camera.focus_distance_m)
+        temperature = np.float32(manifest.temperature * max(1.0, manifest.ranges.k_cam_px.low / camera.k_cam_px))
         floor = thin_lens.depth_error(1.0, camera.focus_distance_m, camera.k_cam_px, LEAST_BLUR_ERROR_PX)
         infinitely_far_px = thin_lens.blur_from_defocus(camera.k_cam_px, camera.gamma_px)
         nearest, farthest = manifest.ranges.depth_ratio

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from service.inference.artifact import Interval, Manifest, ModelFolder
 from service.inference.cancellation import Cancellation
 from service.inference.copies import Read, blend
-from service.inference.depth_map import DepthMap, Reading, all_layers, decide, fraction
+from service.inference.depth_map import NO_ANSWER, DepthMap, Reading, all_layers, decide, fraction
 from service.inference.known import Clues, KnownDepth, around
 from service.inference.later import Later
 from service.inference.pair import GraphPair, RawMaps, Side, Stopwatch
@@ -44,6 +44,9 @@ FEW_ANSWERS = 0.5
 SMALL_PX = 600_000
 KEPT_S = 10.0
 WARM_UP_PX = 64
+# of a lens cap, or an exposure gone wrong: grey levels of all of it, and by how many they differ, noise averaged
+BLACK, WHITE, BLANK_SPREAD = 8.0, 250.0, 1.0
+NOISE_PX = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +125,8 @@ class Estimator:
         area, stopwatch = read.area, request.stopwatch
         size = (area.height_px, area.width_px)
         reading, told = self._reading(request, read, clues)
+        if is_blank := _is_blank(rgb):
+            reading.error.fill(NO_ANSWER)
         if area.height_px * area.width_px > SMALL_PX:
             self._freeing.ask()  # what a large picture has taken is kept for the next one, but for a while only
         request.cancellation.check()
@@ -141,7 +146,9 @@ class Estimator:
             within = part.within(area)
             answer, blur_px = answer.cut(within), within.cells_of(blur_px, size)
         blurrier = fraction(blur_px > read.most_blur_px / reading.scale)
-        warnings = (*told, *self._warnings(reading, whole=part is None), *_hardness(blurrier, answer.valid_fraction))
+        blank = ["the photograph is black or white all over: nothing is seen in it"] if is_blank else []
+        hard = _hardness(blurrier, answer.valid_fraction)
+        warnings = (*blank, *told, *self._warnings(reading, whole=part is None), *hard)
         return replace(answer, warnings=warnings)
 
     def read(self, rgb: NDArray[np.uint8], camera: Camera, side: Side = "auto") -> Read:
@@ -227,6 +234,13 @@ class Estimator:
 def _copied(camera: Camera, scale: float) -> Camera:
     """The camera behind a copy of its pictures made so much smaller."""
     return camera.averaged(*(max(1, round(size * scale)) for size in (camera.image_width_px, camera.image_height_px)))
+
+
+def _is_blank(rgb: NDArray[np.uint8]) -> bool:
+    """Whether a photograph is black or white all over but for its noise."""
+    size = tuple(max(1, pixels // NOISE_PX) for pixels in rgb.shape[1::-1])
+    mean, spread = cv2.meanStdDev(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA))
+    return bool((mean.max() < BLACK or mean.min() > WHITE) and spread.max() < BLANK_SPREAD)
 
 
 def _outside(name: str, value: float, trained: Interval) -> list[str]:

@@ -39,7 +39,7 @@ def expected_x(level: int, camera: Camera = CAMERA) -> float:
     return thin_lens.relative_defocus_from_blur(blur_of(level), camera.gamma_px, camera.k_cam_px)
 
 
-@pytest.mark.parametrize("level", [0, 20, 60, 100, 130])
+@pytest.mark.parametrize("level", [10, 20, 60, 100, 130])
 def test_a_level_of_blur_becomes_the_thin_lens_depth_on_either_side(estimator: Estimator, level: int) -> None:
     x = expected_x(level)
     near = estimator.estimate(grey(level), CAMERA, "near")
@@ -75,10 +75,34 @@ def test_sigma_is_multiplied_by_the_models_temperature(folder: Path) -> None:
 
 def test_sigma_is_never_below_what_a_twentieth_of_a_pixel_does_to_depth(estimator: Estimator) -> None:
     weak = Camera(96, 64, 2.0, 0.5, 0.5)
-    answer = estimator.estimate(grey(4), weak, "near")
+    answer = estimator.estimate(grey(10), weak, "near")
     floor = thin_lens.depth_error(answer.depth_m, 2.0, weak.k_cam_px, LEAST_BLUR_ERROR_PX)
     assert (floor > np.sqrt(2) * LOG_DEPTH_SCALE * answer.depth_m).all()
     np.testing.assert_allclose(answer.sigma_m, floor, rtol=1e-4)
+
+
+def test_by_a_k_cam_below_those_that_the_model_knows_errors_grow_until_nothing_is_answered(
+    estimator: Estimator,
+) -> None:
+    weak, nil = Camera(96, 64, 2.0, 0.1, 0.5), Camera(96, 64, 2.0, 0.01, 0.5)
+    answer = estimator.estimate(grey(13), weak, "near")
+    assert (answer.sigma_m / answer.depth_m > 0.95 * 5 * np.sqrt(2) * LOG_DEPTH_SCALE).all()
+    assert not estimator.estimate(grey(13), nil, "near").valid.any()
+
+
+@pytest.mark.parametrize("level", [2, 253])
+def test_of_a_lens_cap_or_an_overexposed_photograph_nothing_is_answered(estimator: Estimator, level: int) -> None:
+    noise = np.random.default_rng(0).integers(-2, 3, (64, 96, 3))
+    answer = estimator.estimate((level + noise).astype(np.uint8), CAMERA)
+    assert not answer.valid.any()
+    assert np.isnan(answer.depth_m).all()
+    assert answer.warnings[0] == "the photograph is black or white all over: nothing is seen in it"
+
+
+def test_of_a_dark_photograph_with_something_in_it_that_is_answered(estimator: Estimator) -> None:
+    dark = grey(2)
+    dark[:, 48:] = 7
+    assert estimator.estimate(dark, CAMERA).valid.all()
 
 
 @pytest.mark.parametrize("side", ["auto", "near"])
