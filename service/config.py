@@ -79,7 +79,7 @@ class Settings(BaseSettings):
         int, Field(ge=1_000, le=1_000_000_000, description="Largest request body with an image")
     ] = 40_000_000
     max_image_pixels: Annotated[int, Field(ge=1_000, le=100_000_000, description="Largest image, width x height")] = (
-        24_000_000
+        52_000_000
     )
     max_image_aspect: Annotated[
         float, Field(ge=1, le=1_000, description="Most elongated image, longer side / shorter side")

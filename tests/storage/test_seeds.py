@@ -4,6 +4,7 @@ import math
 
 import pytest
 
+from service.config import Settings
 from service.storage.cameras import Cameras
 from service.storage.seeds import seed, seed_drafts
 
@@ -31,6 +32,12 @@ def test_the_cameras_of_the_table_have_its_k_cam_with_a_disc_s_own_k_r() -> None
     for draft, paper in zip(seed_drafts(), TABLE_1_K_CAM, strict=False):
         assert draft.k_r == 4
         assert draft.camera.k_cam_px * 4 / PAPER_K_R == pytest.approx(paper, rel=3e-3), draft.name
+
+
+def test_each_takes_its_own_photographs_without_any_setting() -> None:
+    limit = Settings.model_fields["max_image_pixels"].default
+    for draft in seed_drafts():
+        assert draft.camera.image_width_px * draft.camera.image_height_px <= limit, draft.name
 
 
 def test_phones_have_the_k_cam_of_their_real_lenses() -> None:
