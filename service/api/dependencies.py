@@ -8,6 +8,7 @@ from typing import Annotated
 from fastapi import Depends, Header, Request
 
 from service.api.metrics import Metrics
+from service.api.texts import Worded
 from service.config import Settings
 from service.errors import UnsupportedKind
 from service.inference.artifact import ModelFolder
@@ -77,11 +78,10 @@ async def require_json(request: Request) -> None:
 
 
 IdempotencyKey = Annotated[
-    str | None,
+    Annotated[str, Worded(r"^[!-~]+$", "a key has letters, digits and signs of ASCII, and no spaces")] | None,
     Header(
         min_length=1,
         max_length=255,
-        pattern=r"^[!-~]+$",
         description="Any text, new for every new request: the same request sent again with it is done once (for a day)",
     ),
 ]

@@ -134,6 +134,16 @@ def test_json_has_exactly_the_numbers_of_the_design(bench: TestClient) -> None:
     assert point["sigma_m"] > 0
 
 
+@pytest.mark.parametrize(
+    ("at", "u", "v"),
+    [("32.1234567890,21", 32.123456789, 21), ("1e1,2", 10, 2), ("1, 2", 1, 2), (".5,1.", 0.5, 1), ("+3,4e-1", 3, 0.4)],
+)
+def test_a_number_may_be_written_in_any_way(bench: TestClient, at: str, u: float, v: float) -> None:
+    (point,) = ask(bench, format="json", at=at).json()["points"]
+    assert (point["u"], point["v"]) == (u, v)
+    assert ask(bench, known=f"{at}, 1.1000000000").status_code == 200
+
+
 def test_json_says_null_and_never_nan(bench: TestClient) -> None:
     response = ask(bench, png(grey(230)), format="json", at="3,3", side="auto")
     assert b"NaN" not in response.content
@@ -272,7 +282,11 @@ def test_known_depths_are_of_the_whole_whatever_part_is_asked_for(bench: TestCli
         ({"known": "3,4,inf"}, "u,v,depth_m"),
         ({"known": "3,4,123456"}, "u,v,depth_m"),
         ({"known": ["3,4,1.5"] * 101}, "100"),
-        ({"roi": "1,2,3"}, "roi"),
+        ({"known": "3,4,nan"}, "u,v,depth_m"),
+        ({"at": "1e7,1"}, "u,v"),
+        ({"at": "1," + "0" * 200}, "u,v"),
+        ({"roi": "1,2,3"}, "four whole numbers of pixels, u0,v0,u1,v1"),
+        ({"focus_distance_m": "two"}, "this must be a number"),
         ({"roi": "-1,2,3,4"}, "roi"),
         ({"colour": "red"}, "colour"),
     ],

@@ -132,6 +132,32 @@ def test_nothing_sent_is_echoed(client: TestClient, phone: dict[str, Any]) -> No
     assert typed not in answer.text
 
 
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"name": "no name"}, "a name has letters, digits, dots, dashes and underscores, 64 at most"),
+        ({"name": 7}, "this must be a text"),
+        ({"k_cam_px": "7"}, "this must be a number"),
+        ({"image_width_px": 7.5}, "this must be a whole number"),
+        ({"description": "\x00"}, "no control characters"),
+    ],
+)
+def test_a_fault_is_told_in_words_and_not_by_a_pattern(
+    client: TestClient, phone: dict[str, Any], changes: dict[str, Any], words: str
+) -> None:
+    (fault,) = require_problem(client.post("/cameras", json={**phone, **changes}), 422, "invalid-request")["errors"]
+    assert fault["pointer"] == f"#/{next(iter(changes))}"
+    assert words in fault["detail"]
+
+
+def test_headers_and_parameters_are_told_of_in_words_too(client: TestClient, phone: dict[str, Any]) -> None:
+    spaced = client.post("/cameras", json=phone, headers={"Idempotency-Key": "a b"})
+    assert "no spaces" in require_problem(spaced, 422, "invalid-request")["detail"]
+    named = client.post("/calibrate", params={"camera": "-"})
+    assert "a name has letters" in require_problem(named, 422, "invalid-request")["detail"]
+    assert "whole number" in require_problem(client.get("/cameras?limit=x"), 422, "invalid-request")["detail"]
+
+
 def test_a_lone_surrogate_breaks_nothing(client: TestClient) -> None:
     answer = client.post("/cameras", content=b'{"\\ud800": 1, "name": "\\udfff"}', headers=JSON)
     require_problem(answer, 422, "invalid-request")
