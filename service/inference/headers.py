@@ -43,13 +43,17 @@ MOST_SCANS = 64
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """Stored size in pixels, before orientation (EXIF, 1..8) is applied."""
+    """Stored size in pixels, before orientation (EXIF, 1..8) is applied; ``exif`` is the EXIF, without a signature.
+
+    Of a tiff or raw file that is the file; of a HEIC it is not looked for.
+    """
 
     kind: Kind
     width_px: int
     height_px: int
     orientation: int = 1
     orientation_offset: int | None = None
+    exif: bytes = b""
 
 
 def sniff(data: bytes) -> Kind | None:
@@ -69,6 +73,8 @@ def sniff(data: bytes) -> Kind | None:
 
 def read_header(data: bytes) -> Header:
     """The header of a photograph; ``UnsupportedKind`` for anything else. What a tiff holds may be a raw file."""
+    if not data:
+        raise InvalidImage("The file is empty: send the bytes of one photograph.")
     kind = sniff(data)
     if kind is None:
         raise UnsupportedKind("The bytes are none of JPEG, PNG, TIFF, WebP, HEIC and DNG.")
@@ -92,7 +98,7 @@ def _too_many_parts(kind: str) -> InvalidImage:
 
 def _jpeg(data: bytes) -> Header:
     size: tuple[int, int] | None = None
-    orientation = 1
+    exif = b""
     scans = 0
     for marker, payload in _jpeg_segments(data):
         scans += marker == JPEG_SCAN
@@ -102,10 +108,10 @@ def _jpeg(data: bytes) -> Header:
             height, width = struct.unpack_from(">HH", payload, 1)
             size = (width, height)
         elif marker == JPEG_APP1 and payload.startswith(EXIF_SIGNATURE):
-            orientation = _exif_orientation(payload[len(EXIF_SIGNATURE) :])
+            exif = payload[len(EXIF_SIGNATURE) :]
     if size is None:
         raise InvalidImage("The jpeg file holds no picture.")
-    return Header("jpeg", *size, orientation)
+    return Header("jpeg", *size, _exif_orientation(exif), exif=exif)
 
 
 def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
@@ -134,13 +140,13 @@ def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 def _png(data: bytes) -> Header:
     size = (0, 0)
-    orientation = 1
+    exif = b""
     for name, payload in _png_chunks(data):
         if name == b"IHDR":
             size = struct.unpack_from(">II", payload)
         elif name == b"eXIf":
-            orientation = _exif_orientation(payload)
-    return Header("png", *size, orientation)
+            exif = payload
+    return Header("png", *size, _exif_orientation(exif), exif=exif)
 
 
 def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
@@ -164,7 +170,7 @@ def _webp(data: bytes) -> Header:
     if length + 8 > len(data):
         raise cut_off("webp")
     size: tuple[int, int] | None = None
-    orientation = 1
+    exif = b""
     at = 12
     for _ in range(MOST_PARTS):
         if at > length:
@@ -172,13 +178,13 @@ def _webp(data: bytes) -> Header:
         name, chunk = struct.unpack_from("<4sI", data, at)
         size = size or _webp_size(name, data[at + 8 : at + 18])
         if name == b"EXIF":
-            orientation = _exif_orientation(data[at + 8 : at + 8 + chunk].removeprefix(EXIF_SIGNATURE))
+            exif = data[at + 8 : at + 8 + chunk].removeprefix(EXIF_SIGNATURE)
         at += 8 + chunk + chunk % 2
     else:
         raise _too_many_parts("webp")
     if size is None:
         raise InvalidImage("The webp file holds no picture.")
-    return Header("webp", *size, orientation)
+    return Header("webp", *size, _exif_orientation(exif), exif=exif)
 
 
 def _webp_size(name: bytes, payload: bytes) -> tuple[int, int] | None:
@@ -198,14 +204,14 @@ def _tiff(data: bytes) -> Header:
     directory.require_stored()
     sensor = _sensor_size(data, directory)
     if sensor is not None:
-        return Header("raw", *sensor, directory.orientation())
+        return Header("raw", *sensor, directory.orientation(), exif=data)
     if 3 in directory.values(TIFF_SAMPLE_FORMAT):
         raise UnsupportedKind("A tiff of floating-point numbers is no photograph: send 8 or 16 bits, sRGB.")
     if not set(directory.values(TIFF_BITS)) <= {8, 16}:
         raise UnsupportedKind("A tiff must have 8 or 16 bits a channel.")
     _require_tiles(directory)
     at = directory.offset_of(TIFF_ORIENTATION)
-    return Header("tiff", *directory.size, directory.orientation(), at)
+    return Header("tiff", *directory.size, directory.orientation(), at, data)
 
 
 def _require_tiles(directory: "_TiffDirectory") -> None:

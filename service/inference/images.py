@@ -125,8 +125,6 @@ def declared_kind(media_type: str | None) -> Kind | None:
 
 
 def _read(data: bytes, limits: ImageLimits) -> tuple[Kind, NDArray[np.uint8], int]:
-    if not data:
-        raise InvalidImage("The file is empty: send the bytes of one photograph.")
     if len(data) > limits.max_bytes:
         raise TooLarge(f"The file has {len(data)} bytes, more than the {limits.max_bytes} accepted.")
     header = read_header(data)
