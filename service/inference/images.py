@@ -30,6 +30,9 @@ MEDIA_TYPES: dict[str, Kind] = {
     "image/x-nikon-nef": "raw",
     "image/x-sony-arw": "raw",
 }
+# what some browsers and programs call them
+ALIASES: dict[str, Kind] = {"image/jpg": "jpeg", "image/pjpeg": "jpeg", "image/x-png": "png"}
+CURL_S_OWN = "application/x-www-form-urlencoded"
 UNDECLARED = frozenset({"", "application/octet-stream", "image/*"})
 
 # (transposed, flipped left-right, flipped top-bottom), in this order, by EXIF orientation
@@ -119,9 +122,12 @@ def declared_kind(media_type: str | None) -> Kind | None:
     name = (media_type or "").partition(";")[0].strip().lower()
     if name in UNDECLARED:
         return None
-    if name not in MEDIA_TYPES:
+    if name == CURL_S_OWN:
+        raise UnsupportedKind(f"{name} is what curl says of any body: add -H 'Content-Type: image/jpeg'.")
+    kind = MEDIA_TYPES.get(name) or ALIASES.get(name)
+    if kind is None:
         raise UnsupportedKind(f"{name[:100]} is no photograph: send one of {', '.join(MEDIA_TYPES)}.")
-    return MEDIA_TYPES[name]
+    return kind
 
 
 def _read(data: bytes, limits: ImageLimits) -> tuple[Kind, NDArray[np.uint8], int]:

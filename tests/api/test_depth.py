@@ -201,6 +201,26 @@ def test_every_kind_of_photograph_is_taken(bench: TestClient, make: Any) -> None
     np.testing.assert_allclose(npy(response), depth_near(LEVEL), rtol=0.01)
 
 
+@pytest.mark.parametrize(
+    ("kind", "make"), [("image/jpg", jpeg), ("image/pjpeg", jpeg), ("image/x-png", png), ("IMAGE/JPG; q=1", jpeg)]
+)
+def test_a_kind_may_go_by_another_name(bench: TestClient, kind: str, make: Any) -> None:
+    files = {"image": ("a", make(grey()), kind)}
+    for response in (ask(bench, make(grey()), {"Content-Type": kind}), bench.post("/depth?camera=bench", files=files)):
+        assert response.status_code == 200, response.text
+        assert "declared" not in response.headers["Camind-Warnings"]
+
+
+def test_without_a_focal_length_there_is_no_point_cloud_and_no_camera_matrix(client: TestClient) -> None:
+    client.post("/cameras", json={name: value for name, value in CAMERA.items() if name != "intrinsics"})
+    problem = refused(ask(client, format="ply"), 422, "focal length")
+    assert problem["errors"][0]["pointer"] == "format"
+    response = ask(client, format="npz")
+    assert "K is NaN" in response.headers["Camind-Warnings"]
+    with np.load(io.BytesIO(response.content)) as stored:
+        assert np.isnan(stored["K"][0, 0])
+
+
 def test_an_upright_phone_photograph_is_answered_upright(bench: TestClient) -> None:
     stored = grey(30)
     stored[:, :48] = 120
@@ -308,6 +328,7 @@ def test_an_unknown_camera_is_404(bench: TestClient) -> None:
         (b"this is a letter, not a picture", "image/jpeg", 415, "JPEG"),
         (png(corners()), "text/plain", 415, "text/plain"),
         (png(corners()), "application/json", 415, "application/json"),
+        (png(corners()), "application/x-www-form-urlencoded", 415, "add -H 'Content-Type: image/jpeg'"),
         (b"GIF89a" + bytes(60), "image/gif", 415, "image/gif"),
         (bytes(2_000_001), "image/png", 413, "2000000"),
     ],
