@@ -14,7 +14,7 @@ def stored_camera_of(camera: Camera, width_px: int, height_px: int, orientation:
     """
     unturned = camera.turned(*TURNS[UNTURNS[orientation]])
     fitting = next((one for one in (camera, unturned) if one.is_same_frame(width_px, height_px)), None)
-    return fitting and fitting.resized(width_px, height_px)
+    return fitting and _at_size(fitting, width_px, height_px)
 
 
 def camera_of(photograph: Photograph, camera: Camera) -> tuple[Camera, tuple[str, ...]]:
@@ -31,7 +31,7 @@ def camera_of(photograph: Photograph, camera: Camera) -> tuple[Camera, tuple[str
             f"The photograph has {width_px}x{height_px} pixels upright, the camera "
             f"{camera.image_width_px}x{camera.image_height_px}: send the whole frame, not a crop."
         )
-    resized = fitting.resized(width_px, height_px)
+    resized = _at_size(fitting, width_px, height_px)
     if resized is fitting:
         return fitting, ()
     warning = (
@@ -40,3 +40,9 @@ def camera_of(photograph: Photograph, camera: Camera) -> tuple[Camera, tuple[str
         f"k_cam_px {resized.k_cam_px:.4g} and gamma_px {resized.gamma_px:.4g} were scaled to it"
     )
     return resized, (warning,)
+
+
+def _at_size(camera: Camera, width_px: int, height_px: int) -> Camera:
+    """The camera behind its frame at another size: pixels of a smaller one average those they were made of."""
+    resize = camera.averaged if width_px < camera.image_width_px else camera.resized
+    return resize(width_px, height_px)

@@ -8,6 +8,7 @@ from service.errors import ImageSizeMismatch
 from service.inference.frame import camera_of
 from service.inference.images import TURNS, Photograph, turned
 from service.opencv import cv2
+from service.optics import thin_lens
 from service.optics.camera import Camera, Intrinsics
 
 DISTORTION = (-0.1, 0.02, 0.003, -0.005, 0.001, 0.01, 0.002, 0.001, 0.004, -0.003, 0.002, 0.005)
@@ -64,8 +65,15 @@ def test_a_camera_registered_by_its_upright_size_takes_it_too() -> None:
 def test_a_resized_frame_scales_the_blur_constants_and_says_so(orientation: int) -> None:
     camera, warnings = camera_of(photograph(320, 240, orientation), CAMERA)
     assert camera.k_cam_px == pytest.approx(3.0)
-    assert camera.gamma_px == pytest.approx(0.25)
+    assert camera.gamma_px == pytest.approx(thin_lens.gamma_after_averaging(0.5, 640, 320))
+    assert camera.gamma_px**2 > thin_lens.PIXEL_BOX_VARIANCE > 0.25**2
     assert "k_cam_px 3" in warnings[0]
+    assert f"gamma_px {camera.gamma_px:.4g}" in warnings[0]
+
+
+def test_a_frame_made_larger_scales_gamma_alike() -> None:
+    camera, _ = camera_of(photograph(1280, 960), CAMERA)
+    assert (camera.k_cam_px, camera.gamma_px) == pytest.approx((12.0, 1.0))
 
 
 @pytest.mark.parametrize(("width", "height"), [(640, 400), (480, 640), (641, 300)])
