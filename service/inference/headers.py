@@ -4,12 +4,13 @@ Each parser walks the file's structure once and believes no length that leads ou
 All raise ``InvalidImage`` for a file that is cut off or not of the form its kind prescribes.
 """
 
+import math
 import re
 import struct
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from service.errors import InvalidImage, UnsupportedKind
 from service.inference.heic import primary_picture
@@ -32,6 +33,9 @@ TIFF_SENSOR = frozenset({32803, 34892})
 CR2_MARK = b"CR"
 MOST_DIRECTORIES = 16
 TIFF_TYPES = {1: "B", 3: "H", 4: "I", 13: "I"}
+# with those that are no whole numbers: a rational is two
+TIFF_NUMBERS = {**TIFF_TYPES, 5: "II", 11: "f", 12: "d"}
+EXIF_DIRECTORY, EXIF_F_NUMBER, EXIF_FOCAL_LENGTH = 34665, 33437, 37386
 TIFF_MAX_VALUES = 100_000
 TIFF_MAX_ENTRIES = 4_096
 TIFF_TILE_SIZE = (322, 323)
@@ -54,6 +58,14 @@ class Header:
     orientation: int = 1
     orientation_offset: int | None = None
     exif: bytes = b""
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """What the lens was set to; None for what is not told."""
+
+    focal_length_mm: float | None = None
+    f_number: float | None = None
 
 
 def sniff(data: bytes) -> Kind | None:
@@ -246,6 +258,18 @@ def _exif_orientation(data: bytes) -> int:
         return 1
 
 
+def read_shot(exif: bytes) -> Shot:
+    """What an EXIF block says of the lens, two numbers at most; one that cannot be read says nothing."""
+    try:
+        start = next(iter(_TiffDirectory(exif).values(EXIF_DIRECTORY)), None)
+        if start is None:
+            return Shot()
+        directory = _TiffDirectory(exif, start)
+        return Shot(directory.number(EXIF_FOCAL_LENGTH), directory.number(EXIF_F_NUMBER))
+    except (struct.error, InvalidImage):
+        return Shot()
+
+
 class _TiffDirectory:
     """A directory of a TIFF structure, the form of EXIF too: the first, or the one at ``start``."""
 
@@ -289,7 +313,7 @@ class _TiffDirectory:
             if any(offset + count > len(self._data) for offset, count in stored):
                 raise cut_off("tiff")
 
-    def _unpack(self, form: str, at: int) -> tuple[int, ...]:
+    def _unpack(self, form: str, at: int) -> tuple[Any, ...]:
         return struct.unpack_from(self._order + form, self._data, at)
 
     def offset_of(self, tag: int) -> int | None:
@@ -298,7 +322,7 @@ class _TiffDirectory:
         if entry is None:
             return None
         kind, count = self._unpack("HI", entry + 2)
-        size = struct.calcsize("=" + TIFF_TYPES.get(kind, "I")) * count
+        size = struct.calcsize("=" + TIFF_NUMBERS.get(kind, "I")) * count
         return entry + 8 if size <= 4 else self._unpack("I", entry + 8)[0]
 
     def values(self, tag: int) -> tuple[int, ...]:
@@ -312,6 +336,18 @@ class _TiffDirectory:
         if count > TIFF_MAX_VALUES:
             raise InvalidImage(f"The tiff file states {count} values for tag {tag}.")
         return self._unpack(f"{count}{TIFF_TYPES[kind]}", at)
+
+    def number(self, tag: int) -> float | None:
+        """A tag's first number, of any type; None without one that is positive and finite."""
+        at = self.offset_of(tag)
+        if at is None:
+            return None
+        (kind,) = self._unpack("H", self._entries[tag] + 2)
+        if kind not in TIFF_NUMBERS:
+            return None
+        over, *under = self._unpack(TIFF_NUMBERS[kind], at)
+        value = over / (under[0] or math.nan) if under else over
+        return value if 0 < value < math.inf else None
 
     def orientation(self) -> int:
         value = next(iter(self.values(TIFF_ORIENTATION)), 1)

@@ -25,7 +25,7 @@ from service.inference.worker import Worker
 from service.opencv import cv2
 from service.optics import thin_lens
 from tests.inference.oracle_pair import blur_of
-from tests.inference.photographs import corners, hostile_png, jpeg, png, tiff, webp
+from tests.inference.photographs import corners, exif_of, hostile_png, jpeg, png, tiff, webp, with_exif
 
 CAMERA = {
     "name": "bench",
@@ -262,6 +262,15 @@ def test_a_lens_moves_focus_exactly_but_not_nearer_than_its_focal_length(
         assert stored["K"][0, 0] == pytest.approx(35e3 / 6.05 * 645 / 3872)
     problem = refused(ask(client, picture, camera="d200", focus_distance_m=0.03), 422, "focal length")
     assert problem["errors"][0]["pointer"] == "focus_distance_m"
+
+
+def test_a_photograph_by_another_lens_is_warned_of(client: TestClient, d200: dict[str, Any]) -> None:
+    client.post("/cameras", json=d200)
+    client.post("/cameras", json={**CAMERA, "image_width_px": 645, "image_height_px": 432})
+    other = with_exif(jpeg(grey(60, 432, 645)), exif_of({}, {0x920A: (50, 1), 0x829D: (12, 10)}))
+    warned = ask(client, other, {"Content-Type": "image/jpeg"}, camera="d200").headers["Camind-Warnings"]
+    assert warned == "its EXIF says 50 mm f/1.2, the camera is 35 mm f/2.8"
+    assert "EXIF" not in ask(client, other).headers["Camind-Warnings"]
 
 
 def test_known_depths_tell_where_this_shot_was_focused(bench: TestClient) -> None:
