@@ -3,11 +3,13 @@
 All are coroutines, though they wait for nothing: FastAPI gives each plain function a thread, which costs more.
 """
 
-from typing import Annotated
+from typing import Annotated, get_origin
 
-from fastapi import Depends, Header, Request
+from fastapi import Depends, Header, Request, params
+from fastapi.dependencies.utils import get_flat_params
 
 from service.api.metrics import Metrics
+from service.api.problems import invalid_request
 from service.api.texts import Worded
 from service.config import Settings
 from service.errors import UnsupportedKind
@@ -67,6 +69,25 @@ async def get_runner(request: Request) -> Runner:
 async def get_metrics(request: Request) -> Metrics:
     metrics: Metrics = request.app.state.metrics
     return metrics
+
+
+async def require_known_parameters(request: Request) -> None:
+    """Refuse what the query has and the route does not know, and all but lists that come more than once."""
+    names = [name for name, _ in request.query_params.multi_items()]
+    if not names:
+        return
+    is_list = {
+        field.alias: get_origin(field.field_info.annotation) in (list, tuple)
+        for field in get_flat_params(request.scope["route"].dependant)
+        if not isinstance(field.field_info, params.Path | params.Header)
+    }
+    faults = [
+        {"type": "repeated" if name in is_list else "extra_forbidden", "loc": ("query", name), "msg": "send this once"}
+        for name in dict.fromkeys(names)
+        if name not in is_list or (names.count(name) > 1 and not is_list[name])
+    ]
+    if faults:
+        raise invalid_request(faults)
 
 
 async def require_json(request: Request) -> None:

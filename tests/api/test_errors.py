@@ -158,6 +158,40 @@ def test_headers_and_parameters_are_told_of_in_words_too(client: TestClient, pho
     assert "whole number" in require_problem(client.get("/cameras?limit=x"), 422, "invalid-request")["detail"]
 
 
+@pytest.mark.parametrize(
+    ("method", "path", "query", "name", "words"),
+    [
+        ("GET", "/cameras", "limits=2", "limits", "no such"),
+        ("GET", "/cameras", "limit=1&limit=2", "limit", "once"),
+        ("GET", "/cameras/x", "points=2", "points", "no such"),
+        ("GET", "/cameras/x/curve", "near=1", "near", "no such"),
+        ("GET", "/cameras/x/curve", "name=x", "name", "no such"),
+        ("GET", "/cameras/x/curve", "near_m=1&near_m=2", "near_m", "once"),
+        ("GET", "/calibrations", "page=2", "page", "no such"),
+        ("GET", "/calibrate/target.svg", "row=3", "row", "no such"),
+        ("GET", "/calibrate/target.pdf", "rows=3&rows=4", "rows", "once"),
+        ("POST", "/calibrate/look", "roi=1", "roi", "no such"),
+        ("POST", "/photographs/preview", "longest_px=99&longest_px=98", "longest_px", "once"),
+        ("POST", "/depth", "camera=a&camera=b", "camera", "once"),
+        ("POST", "/depth", "camera=a&focus_distance_m=1&focus_distance_m=2", "focus_distance_m", "once"),
+        ("POST", "/depth", "camera=a&query=1", "query", "no such"),
+        ("DELETE", "/cameras/x", "if-match=1", "if-match", "no such"),
+    ],
+)
+def test_a_parameter_that_is_unknown_or_sent_twice_is_named(
+    client: TestClient, method: str, path: str, query: str, name: str, words: str
+) -> None:
+    body = require_problem(client.request(method, f"{path}?{query}"), 422, "invalid-request")
+    (fault,) = body["errors"]
+    assert fault["pointer"] == name
+    assert words in fault["detail"]
+
+
+def test_a_page_s_address_may_have_any_query(client: TestClient) -> None:
+    for path in ("/", "/health/live", "/model", "/web/app.js"):
+        assert client.get(f"{path}?from=mail&from=mail").status_code == 200
+
+
 def test_a_lone_surrogate_breaks_nothing(client: TestClient) -> None:
     answer = client.post("/cameras", content=b'{"\\ud800": 1, "name": "\\udfff"}', headers=JSON)
     require_problem(answer, 422, "invalid-request")
