@@ -18,6 +18,7 @@ from service.inference.heic import primary_picture
 Kind = Literal["jpeg", "png", "tiff", "webp", "heic", "raw"]
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_READ = frozenset({b"IHDR", b"eXIf", b"acTL"})
 EXIF_SIGNATURE = b"Exif\x00\x00"
 HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"mif1"})
 JPEG_MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
@@ -26,6 +27,7 @@ JPEG_END, JPEG_SCAN, JPEG_APP1 = 0xD9, 0xDA, 0xE1
 JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 JPEG_BARE = frozenset({0x01, 0xD8, *range(0xD0, 0xD8)})
 TIFF_WIDTH, TIFF_HEIGHT, TIFF_BITS, TIFF_ORIENTATION, TIFF_SAMPLE_FORMAT = 256, 257, 258, 274, 339
+TIFF_NEW_SUBFILE = 254
 TIFF_STORES = ((273, 279), (324, 325))
 TIFF_PHOTOMETRIC, TIFF_SUB_DIRECTORIES, TIFF_DNG_VERSION = 262, 330, 50706
 # photometric interpretations of sensor values: a filter array, and the same after demosaicing
@@ -49,7 +51,7 @@ MOST_SCANS = 64
 class Header:
     """Stored size in pixels, before orientation (EXIF, 1..8) is applied; ``exif`` is the EXIF, without a signature.
 
-    Of a tiff or raw file that is the file; of a HEIC it is not looked for.
+    Of a tiff or raw file that is the file; of a HEIC it is not looked for. ``has_more``: other pages or frames follow.
     """
 
     kind: Kind
@@ -58,6 +60,7 @@ class Header:
     orientation: int = 1
     orientation_offset: int | None = None
     exif: bytes = b""
+    has_more: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,14 +154,16 @@ def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _png(data: bytes) -> Header:
-    size = (0, 0)
+    size, frames = (0, 0), 1
     exif = b""
     for name, payload in _png_chunks(data):
         if name == b"IHDR":
             size = struct.unpack_from(">II", payload)
         elif name == b"eXIf":
             exif = payload
-    return Header("png", *size, _exif_orientation(exif), exif=exif)
+        elif name == b"acTL":
+            frames = int.from_bytes(payload[:4], "big")
+    return Header("png", *size, _exif_orientation(exif), exif=exif, has_more=frames > 1)
 
 
 def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
@@ -170,7 +175,7 @@ def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
         (checksum,) = struct.unpack_from(">I", data, end)
         if zlib.crc32(memoryview(data)[at + 4 : end]) != checksum:
             raise InvalidImage(f"The png file is damaged: its {name.decode('latin-1')!r} part fails its checksum.")
-        yield name, data[at + 8 : end] if name in (b"IHDR", b"eXIf") else b""
+        yield name, data[at + 8 : end] if name in PNG_READ else b""
         at = end + 4
         if name == b"IEND":
             return
@@ -183,12 +188,14 @@ def _webp(data: bytes) -> Header:
         raise cut_off("webp")
     size: tuple[int, int] | None = None
     exif = b""
+    frames = 0
     at = 12
     for _ in range(MOST_PARTS):
         if at > length:
             break
         name, chunk = struct.unpack_from("<4sI", data, at)
         size = size or _webp_size(name, data[at + 8 : at + 18])
+        frames += name == b"ANMF"
         if name == b"EXIF":
             exif = data[at + 8 : at + 8 + chunk].removeprefix(EXIF_SIGNATURE)
         at += 8 + chunk + chunk % 2
@@ -196,7 +203,7 @@ def _webp(data: bytes) -> Header:
         raise _too_many_parts("webp")
     if size is None:
         raise InvalidImage("The webp file holds no picture.")
-    return Header("webp", *size, _exif_orientation(exif), exif=exif)
+    return Header("webp", *size, _exif_orientation(exif), exif=exif, has_more=frames > 1)
 
 
 def _webp_size(name: bytes, payload: bytes) -> tuple[int, int] | None:
@@ -223,7 +230,16 @@ def _tiff(data: bytes) -> Header:
         raise UnsupportedKind("A tiff must have 8 or 16 bits a channel.")
     _require_tiles(directory)
     at = directory.offset_of(TIFF_ORIENTATION)
-    return Header("tiff", *directory.size, directory.orientation(), at, data)
+    return Header("tiff", *directory.size, directory.orientation(), at, data, _has_more_pages(data, directory))
+
+
+def _has_more_pages(data: bytes, first: "_TiffDirectory") -> bool:
+    """Whether pages follow; a smaller copy of the first is none."""
+    try:
+        pages = [_TiffDirectory(data, start) for start in first.following(MOST_DIRECTORIES)]
+        return not all(1 & next(iter(page.values(TIFF_NEW_SUBFILE)), 0) for page in pages)
+    except (struct.error, InvalidImage):
+        return False
 
 
 def _require_tiles(directory: "_TiffDirectory") -> None:

@@ -94,7 +94,9 @@ def read_photograph(data: bytes, media_type: str | None = None, limits: ImageLim
     declared = declared_kind(media_type)
     header, stored = _read(data, limits or ImageLimits())
     kind, orientation = header.kind, header.orientation
-    warnings = (f"declared {media_type}, read as {kind}",) if declared not in (None, kind) else ()
+    warnings: tuple[str, ...] = (f"declared {media_type}, read as {kind}",) if declared not in (None, kind) else ()
+    if header.has_more:
+        warnings += ("the file has more than one picture: the first was read",)
     height, width = stored.shape[:2]
     upright = turned(stored, orientation)
     return Photograph(upright, kind, orientation, width, height, warnings, read_shot(header.exif))

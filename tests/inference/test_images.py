@@ -254,3 +254,39 @@ def test_what_the_lens_was_set_to_is_read_at_once_and_no_damage_stops_it() -> No
     assert time.perf_counter() - started < 0.1
     for length in range(len(exif)):
         read_shot(exif[:length])
+
+
+def pages(*subfiles: int) -> bytes:
+    """A tiff of the corners and more pages, each of a kind (1: a smaller copy)."""
+    out = BytesIO()
+    with tifffile.TiffWriter(out) as writer:
+        for kind in (0, *subfiles):
+            writer.write(corners(), photometric="rgb", subfiletype=kind, metadata=None)
+    return out.getvalue()
+
+
+def animated(kind: str, frames: int) -> bytes:
+    """So many frames, the first of the corners."""
+    animation = cv2.Animation()
+    animation.frames = [np.ascontiguousarray(corners()[..., ::-1]), *([np.zeros((48, 64, 3), np.uint8)] * (frames - 1))]
+    animation.durations = [100] * frames
+    is_written, body = cv2.imencodeanimation(kind, animation)
+    assert is_written
+    return body.tobytes()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [pages(0), pages(1, 0), animated(".webp", 3), animated(".png", 2)],
+    ids=["tiff", "tiff with a copy", "webp", "png"],
+)
+def test_of_several_pictures_the_first_is_read_and_that_is_told(data: bytes) -> None:
+    photograph = read_photograph(data)
+    assert photograph.warnings == ("the file has more than one picture: the first was read",)
+    assert photograph.rgb[4, 4].argmax() == 0
+    assert photograph.rgb[4, -5].argmax() == 1
+
+
+@pytest.mark.parametrize("data", [pages(), pages(1), png(corners()), webp(corners())])
+def test_of_one_picture_nothing_is_told(data: bytes) -> None:
+    assert read_photograph(data).warnings == ()
