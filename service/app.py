@@ -7,7 +7,7 @@ from functools import partial
 from importlib.metadata import version
 from typing import Any
 
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 from fastapi_offline import FastAPIOffline
 from threadpoolctl import threadpool_limits
 
@@ -26,9 +26,12 @@ from service.api import (
     photographs,
     target,
 )
+from service.api.dependencies import require_known_parameters
+from service.api.problems import responses
 from service.api.uploads import Arrivals
 from service.calibration.calibrate import calibrate
 from service.config import Settings
+from service.errors import BadRequest
 from service.inference.artifact import load_model_folder
 from service.inference.estimator import Estimator
 from service.inference.images import ImageLimits
@@ -84,7 +87,11 @@ def create_app(settings: Settings, calibrate: Calibrate = calibrate) -> FastAPI:
     app.state.arrivals = Arrivals((settings.worker_slots + settings.queue_size) * settings.max_image_bytes)
     _add_middleware(app, settings)
     handlers.install(app)
-    for part in (cameras, depth, photographs, calibrations, look, target, model, health, metrics, pages):
+    for part in (cameras, depth, photographs, calibrations, look, target):
+        app.include_router(
+            part.router, dependencies=[Depends(require_known_parameters)], responses=responses(BadRequest)
+        )
+    for part in (model, health, metrics, pages):
         app.include_router(part.router)
     # FastAPI's own way to another description: https://fastapi.tiangolo.com/how-to/extending-openapi/
     replaceable: Any = app

@@ -216,7 +216,7 @@ def read_curve(
 
 def _drafted(data: bytes) -> Draft:
     header = read_header(data)
-    return draft_camera(read_exif(data), header.width_px, header.height_px)
+    return draft_camera(read_exif(header.exif or data), header.width_px, header.height_px)
 
 
 def _answer(record: CameraRecord, response: Response) -> CameraRead:

@@ -3,11 +3,14 @@
 All are coroutines, though they wait for nothing: FastAPI gives each plain function a thread, which costs more.
 """
 
-from typing import Annotated
+from typing import Annotated, get_origin
 
-from fastapi import Depends, Header, Request
+from fastapi import Depends, Header, Request, params
+from fastapi.dependencies.utils import get_flat_params
 
 from service.api.metrics import Metrics
+from service.api.problems import invalid_request
+from service.api.texts import Worded
 from service.config import Settings
 from service.errors import UnsupportedKind
 from service.inference.artifact import ModelFolder
@@ -68,6 +71,25 @@ async def get_metrics(request: Request) -> Metrics:
     return metrics
 
 
+async def require_known_parameters(request: Request) -> None:
+    """Refuse what the query has and the route does not know, and all but lists that come more than once."""
+    names = [name for name, _ in request.query_params.multi_items()]
+    if not names:
+        return
+    is_list = {
+        field.alias: get_origin(field.field_info.annotation) in (list, tuple)
+        for field in get_flat_params(request.scope["route"].dependant)
+        if not isinstance(field.field_info, params.Path | params.Header)
+    }
+    faults = [
+        {"type": "repeated" if name in is_list else "extra_forbidden", "loc": ("query", name), "msg": "send this once"}
+        for name in dict.fromkeys(names)
+        if name not in is_list or (names.count(name) > 1 and not is_list[name])
+    ]
+    if faults:
+        raise invalid_request(faults)
+
+
 async def require_json(request: Request) -> None:
     """Refuse a body that does not say it is JSON; an empty one is left to validation."""
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
@@ -77,11 +99,10 @@ async def require_json(request: Request) -> None:
 
 
 IdempotencyKey = Annotated[
-    str | None,
+    Annotated[str, Worded(r"^[!-~]+$", "a key has letters, digits and signs of ASCII, and no spaces")] | None,
     Header(
         min_length=1,
         max_length=255,
-        pattern=r"^[!-~]+$",
         description="Any text, new for every new request: the same request sent again with it is done once (for a day)",
     ),
 ]

@@ -28,7 +28,7 @@ from service.inference.cancellation import Cancellation
 from service.inference.depth_map import DepthMap
 from service.inference.encode import ENCODERS, MEDIA_TYPES, Encoded, pixel_at, read_point, spread_of
 from service.inference.estimator import Estimator
-from service.inference.frame import camera_of
+from service.inference.frame import camera_of, other_lens
 from service.inference.images import ImageLimits, read_photograph
 from service.inference.pair import Stopwatch
 from service.inference.part import Part
@@ -151,6 +151,8 @@ def fulfil(cancellation: Cancellation, order: Order, estimator: Estimator) -> An
     with stopwatch.stage("decode"):
         photograph = read_photograph(order.upload.data, order.upload.media_type, order.limits)
     camera, resized = camera_of(photograph, order.camera)
+    lens = order.record.draft.lens
+    taken = other_lens(photograph.shot, lens) if lens else ()
     part = order.query.part or Part(0, 0, photograph.width_px, photograph.height_px)
     part.require_within(photograph.width_px, photograph.height_px)
     for u, v in order.query.points:
@@ -160,7 +162,7 @@ def fulfil(cancellation: Cancellation, order: Order, estimator: Estimator) -> An
         pixel_at(point.u, point.v, Part(0, 0, photograph.width_px, photograph.height_px), "known")
     depth_map = estimator.estimate(photograph.rgb, camera, order.query.side, cancellation, order.query.part, known)
     stopwatch.add(depth_map.timings_ms)
-    warnings = (*order.warnings, *photograph.warnings, *resized, *depth_map.warnings)
+    warnings = (*order.warnings, *photograph.warnings, *taken, *resized, *depth_map.warnings)
     with stopwatch.stage("encode"):
         if order.format == JSON:
             encoded = _encode_json(depth_map, order, part, estimator.manifest.name, warnings)

@@ -1,35 +1,59 @@
 """What ``POST /depth`` can be asked, and its answer in numbers."""
 
-import re
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
+from service.api.texts import Worded, numbers_in
 from service.inference.known import KnownDepth
 from service.inference.pair import Side
 from service.inference.part import Part
 
-ROI = r"^\d{1,6},\d{1,6},\d{1,6},\d{1,6}$"
 MAX_POINTS = 1000
 MAX_KNOWN = 100
-POINT = r"^-?\d{1,6}(\.\d{1,6})?,-?\d{1,6}(\.\d{1,6})?$"
-KNOWN = POINT[:-1] + r",([1-9]\d{0,4}(\.\d{1,6})?|0\.0{0,2}[1-9]\d{0,5})$"
+MOST_PIXELS = 1_000_000
+DEPTHS_M = (0.001, 100_000)
+# the plainest forms of what is read, for programs; numbers may be written in any other way, too
+ROI = r"^\d{1,6},\d{1,6},\d{1,6},\d{1,6}$"
+POINT = r"^-?\d{1,6}(\.\d{1,20})?,-?\d{1,6}(\.\d{1,20})?$"
+KNOWN = POINT[:-1] + r",([1-9]\d{0,4}(\.\d{1,20})?|0\.0{0,2}[1-9]\d{0,20})$"
 
 
-def _require_point(value: str) -> str:
-    if not re.fullmatch(POINT, value):
-        raise ValueError("a point is two numbers of pixels, u,v: for instance 320,216")
-    return value
+def _point_in(text: str) -> tuple[float, float]:
+    u, v = numbers_in(text)
+    if max(abs(u), abs(v)) >= MOST_PIXELS:
+        raise ValueError("no photograph has so many pixels")
+    return u, v
 
 
-def _require_known(value: str) -> str:
-    if not re.fullmatch(KNOWN, value):
-        raise ValueError("a known depth is a pixel and metres from 0.001 on, u,v,depth_m: for instance 320,216,1.25")
-    return value
+def _known_in(text: str) -> KnownDepth:
+    pixel, _, depth = text.rpartition(",")
+    (depth_m,) = numbers_in(depth)
+    if not DEPTHS_M[0] <= depth_m <= DEPTHS_M[1]:
+        raise ValueError("no such depth")
+    return KnownDepth(*_point_in(pixel), depth_m)
+
+
+def _require_point(text: str) -> str:
+    try:
+        _point_in(text)
+    except ValueError:
+        raise ValueError("a point is two numbers of pixels, u,v: for instance 320,216") from None
+    return text
+
+
+def _require_known(text: str) -> str:
+    try:
+        _known_in(text)
+    except ValueError:
+        words = "a known depth is a pixel and metres from 0.001 on, u,v,depth_m: for instance 320,216,1.25"
+        raise ValueError(words) from None
+    return text
 
 
 Point = Annotated[str, AfterValidator(_require_point), Field(json_schema_extra={"pattern": POINT})]
 Known = Annotated[str, AfterValidator(_require_known), Field(json_schema_extra={"pattern": KNOWN})]
+Corners = Annotated[str, Worded(ROI, "a part is four whole numbers of pixels, u0,v0,u1,v1: for instance 0,0,320,216")]
 
 
 class DepthQuery(BaseModel):
@@ -50,11 +74,8 @@ class DepthQuery(BaseModel):
         Field(max_length=MAX_POINTS, description="Pixels u,v to read, repeatable; answered in json"),
     ] = ()
     roi: Annotated[
-        str | None,
-        Field(
-            pattern=ROI,
-            description="Part u0,v0,u1,v1 of the upright photograph to answer alone; u1 and v1 lie outside it",
-        ),
+        Corners | None,
+        Field(description="Part u0,v0,u1,v1 of the upright photograph to answer alone; u1 and v1 lie outside it"),
     ] = None
     focus_distance_m: Annotated[
         float | None,
@@ -72,12 +93,12 @@ class DepthQuery(BaseModel):
     @property
     def known_depths(self) -> list[KnownDepth]:
         """What is known of the photograph."""
-        return [KnownDepth(*map(float, text.split(","))) for text in self.known]
+        return [_known_in(text) for text in self.known]
 
     @property
     def points(self) -> list[tuple[float, float]]:
         """The pixels asked for, (u, v)."""
-        return [(_number(u), _number(v)) for u, v in (text.split(",") for text in self.at)]
+        return [_point_in(text) for text in self.at]
 
     @property
     def part(self) -> Part | None:
@@ -97,13 +118,17 @@ class SpreadRead(BaseModel):
     max: float | None
 
 
+# whole numbers are written without a point
+Coordinate = Annotated[int | float, BeforeValidator(lambda number: int(number) if number % 1 == 0 else number)]
+
+
 class PointRead(BaseModel):
     """Depth at one pixel: metres along the optical axis, one standard deviation, and the other hypothesis."""
 
     model_config = ConfigDict(from_attributes=True)
 
-    u: int | float
-    v: int | float
+    u: Coordinate
+    v: Coordinate
     depth_m: float | None
     depth_alt_m: float | None
     sigma_m: float | None
@@ -122,7 +147,3 @@ class DepthRead(BaseModel):
     valid_fraction: Annotated[float, Field(ge=0, le=1)]
     points: list[PointRead]
     warnings: list[str]
-
-
-def _number(text: str) -> float:
-    return float(text) if "." in text else int(text)

@@ -20,7 +20,7 @@ from service.inference.cancellation import Cancellation
 from service.inference.drafting import draft_camera
 from service.inference.exif import read_exif
 from service.inference.frame import stored_camera_of
-from service.inference.headers import read_header
+from service.inference.headers import Header, read_header
 from service.inference.images import ImageLimits, read_stored_frame
 from service.optics.camera import Camera, Intrinsics, Lens
 
@@ -67,21 +67,21 @@ def fulfil(cancellation: Cancellation, order: Order) -> LookRead:
     rgb = read_stored_frame(order.data, order.limits)
     cancellation.check()
     height_px, width_px = rgb.shape[:2]
-    orientation = read_header(order.data).orientation
-    intrinsics, source = _intrinsics(order, width_px, height_px, orientation)
+    header = read_header(order.data)
+    intrinsics, source = _intrinsics(order, width_px, height_px, header)
     seen = look(rgb, order.grid, intrinsics, cancellation.check)
-    return LookRead.from_look(seen, orientation, source if seen.distance_m else None)
+    return LookRead.from_look(seen, header.orientation, source if seen.distance_m else None)
 
 
 def _intrinsics(
-    order: Order, width_px: int, height_px: int, orientation: int
+    order: Order, width_px: int, height_px: int, header: Header
 ) -> tuple[Intrinsics | None, FocalLengthFrom | None]:
     """Those of the camera at the stored frame's size, else what the EXIF tells of the lens."""
-    camera = order.camera and stored_camera_of(order.camera, width_px, height_px, orientation)
+    camera = order.camera and stored_camera_of(order.camera, width_px, height_px, header.orientation)
     if camera and camera.intrinsics:
         return camera.intrinsics, "camera"
-    guess = draft_camera(read_exif(order.data), width_px, height_px).lens
+    guess = draft_camera(read_exif(header.exif or order.data), width_px, height_px).lens
     if guess.focal_length_mm is None or guess.pixel_pitch_um is None:
         return None, None
-    lens = Lens(guess.focal_length_mm, 1.0, guess.pixel_pitch_um, guess.sensor_width_px)
+    lens = Lens(guess.focal_length_mm, 1.0, guess.pixel_pitch_um, guess.sensor_width_px or width_px)
     return Intrinsics.centred(lens.fx_px(width_px), width_px, height_px), "exif"

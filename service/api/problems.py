@@ -15,6 +15,18 @@ PROBLEM_TYPE = "application/problem+json"
 PROBLEM_KEY = "camind.problem"
 TYPE_PREFIX = "urn:camind:problem:"
 MAX_ERRORS = 50
+# pydantic's kinds of faults that are told in plainer words than its own
+A_NUMBER, A_WHOLE_NUMBER = "this must be a number", "this must be a whole number"
+PLAIN_WORDS = {
+    "string_type": "this must be a text",
+    "float_type": A_NUMBER,
+    "float_parsing": A_NUMBER,
+    "finite_number": "this must be a finite number",
+    "int_type": A_WHOLE_NUMBER,
+    "int_parsing": A_WHOLE_NUMBER,
+    "int_from_float": A_WHOLE_NUMBER,
+    "bool_type": "this must be true or false",
+}
 # what reading the database may answer, and what writing to it may
 STORE_ERRORS = (Busy, NotReady)
 WRITE_ERRORS = (*STORE_ERRORS, InsufficientStorage)
@@ -172,7 +184,8 @@ def _detail(fault: Mapping[str, Any]) -> str:
         return f"This is no JSON: {fault['ctx']['error']} at character {fault['loc'][-1]}."
     if fault["type"] == "extra_forbidden":
         return _unknown_field(str(fault["loc"][-1]))
-    return _printable(str(fault["msg"]).removeprefix("Value error, "))
+    words = PLAIN_WORDS.get(fault["type"], str(fault["msg"]))
+    return _printable(words.removeprefix("Value error, "))
 
 
 def _unknown_field(name: str) -> str:

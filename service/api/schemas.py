@@ -6,14 +6,22 @@ from typing import Annotated, Self
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from service.api.cursors import NextCursor
+from service.api.texts import Worded
 from service.errors import BadRequest, FieldProblem
 from service.optics.camera import Camera, Intrinsics, Lens
 from service.storage.cameras import DEFAULT_K_R, NAME_PATTERN, CameraDraft, CameraRecord, Source
 
 DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 PLAIN_TEXT = r"^[^\x00-\x08\x0b\x0c\x0e-\x1f\x7f]*$"
+NO_CONTROLS = "a description has no control characters but tabs and line breaks"
 
-Name = Annotated[str, Field(pattern=NAME_PATTERN, description="Unique; stands in the camera's URL", examples=["d200"])]
+A_NAME = "a name has letters, digits, dots, dashes and underscores, 64 at most, and begins with a letter or digit"
+
+Name = Annotated[
+    str,
+    Worded(NAME_PATTERN, A_NAME),
+    Field(description="Unique; stands in the camera's URL", examples=["d200"]),
+]
 Pixels = Annotated[int, Field(gt=0, le=100_000)]
 Metres = Annotated[float, Field(ge=0.001, le=100_000, allow_inf_nan=False)]
 BlurPixels = Annotated[float, Field(ge=1e-6, le=1_000_000, allow_inf_nan=False)]
@@ -109,7 +117,7 @@ class CameraSpecs(Given):
         float, Field(ge=0, le=1_000, allow_inf_nan=False, description="Blur of a point in perfect focus")
     ] = 0.5
     intrinsics: PinholeIntrinsics | None = None
-    description: Annotated[str | None, Field(max_length=1000, pattern=PLAIN_TEXT)] = None
+    description: Annotated[Annotated[str, Worded(PLAIN_TEXT, NO_CONTROLS)] | None, Field(max_length=1000)] = None
 
     def to_camera(self) -> Camera:
         """The camera as the physics takes it; ``BadRequest`` where the numbers do not fit together."""

@@ -30,7 +30,7 @@ class LensGuess:
     focal_length_mm: float | None
     f_number: float | None
     pixel_pitch_um: float | None
-    sensor_width_px: int
+    sensor_width_px: int | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,34 +49,27 @@ class Draft:
 def draft_camera(exif: Exif, width_px: int, height_px: int) -> Draft:
     """The camera of a photograph of this stored size, from its EXIF."""
     warnings: list[str] = []
-    sensor_width_px = max(exif.width_px or width_px, width_px)
-    if sensor_width_px != width_px:
-        warnings.append(
-            f"EXIF says {sensor_width_px} pixels wide and the file has {width_px}: taken as resized; a crop would "
-            "make k_cam wrong"
-        )
-    width_mm = _sensor_width_mm(exif, sensor_width_px, width_px / height_px, warnings)
+    pitch_um, sensor_width_px = _sensor(exif, width_px, width_px / height_px, warnings)
     for value, words in (
         (exif.focal_length_mm, "the focal length is not in its EXIF: lens.focal_length_mm is needed"),
         (exif.f_number, "the aperture is not in its EXIF: lens.f_number is needed"),
-        (width_mm, "nothing tells the size of the sensor: lens.pixel_pitch_um is needed"),
+        (pitch_um, "nothing tells the size of the sensor: lens.pixel_pitch_um is needed"),
+        (sensor_width_px, "nothing tells how many pixels wide the sensor is: lens.sensor_width_px is needed"),
     ):
         if value is None:
             warnings.append(words)
-    if (exif.digital_zoom or 1) > MOST_ZOOM:
-        warnings.append(f"taken with a digital zoom of {exif.digital_zoom:g}: the frame is a part of the sensor's")
+    if _zoom(exif) > MOST_ZOOM:
+        warnings.append(
+            f"taken with a digital zoom of {exif.digital_zoom:g}: the frame is a part of the sensor's, enlarged, and "
+            "lens.pixel_pitch_um that of what it shows"
+        )
     return Draft(
         name=_name(exif),
         description=", ".join(filter(None, (_body(exif), exif.lens))) or None,
         image_width_px=width_px,
         image_height_px=height_px,
         focus_distance_m=_focus_m(exif, warnings),
-        lens=LensGuess(
-            exif.focal_length_mm,
-            exif.f_number,
-            width_mm and (round(1e3 * width_mm / sensor_width_px, 4) or None),
-            sensor_width_px,
-        ),
+        lens=LensGuess(exif.focal_length_mm, exif.f_number, pitch_um, sensor_width_px),
         warnings=tuple(warnings),
     )
 
@@ -97,9 +90,35 @@ def _focus_m(exif: Exif, warnings: list[str]) -> float | None:
     return distance_m
 
 
-def _sensor_width_mm(exif: Exif, sensor_width_px: int, aspect: float, warnings: list[str]) -> float | None:
+def _zoom(exif: Exif) -> float:
+    return max(exif.digital_zoom or 1.0, 1.0)
+
+
+def _sensor(exif: Exif, width_px: int, aspect: float, warnings: list[str]) -> tuple[float | None, int | None]:
+    """Pitch in µm and width in pixels of the sensor, as if the picture were all of it.
+
+    A picture that says nothing of its width in the camera may be a small copy: then its own width is no sensor's. Where
+    the sensor's width in mm is known any such pair is as good.
+    """
+    sensor_width_px = exif.width_px if exif.width_px and exif.width_px >= width_px else None
+    if sensor_width_px not in (None, width_px):
+        warnings.append(
+            f"EXIF says {sensor_width_px} pixels wide and the file has {width_px}: taken as resized; a crop would "
+            "make k_cam wrong"
+        )
+    width_mm = _sensor_width_mm(exif, sensor_width_px, aspect, warnings)
+    if width_mm is not None:
+        sensor_width_px = sensor_width_px or width_px
+        pitch_um: float | None = 1e3 * width_mm / sensor_width_px
+    else:
+        pitch_um = None if sensor_width_px else exif.focal_plane_pitch_um
+    # a zoom enlarges a part of the sensor to as many pixels
+    return pitch_um and (round(pitch_um / _zoom(exif), 4) or None), sensor_width_px
+
+
+def _sensor_width_mm(exif: Exif, sensor_width_px: int | None, aspect: float, warnings: list[str]) -> float | None:
     """From the pixel pitch, else the camera's known crop factor, else the two focal lengths; the surest first."""
-    if exif.focal_plane_pitch_um:
+    if exif.focal_plane_pitch_um and sensor_width_px:
         width_mm = exif.focal_plane_pitch_um * sensor_width_px / 1e3
         if SENSOR_WIDTHS_MM[0] <= width_mm <= SENSOR_WIDTHS_MM[1]:
             return width_mm
@@ -108,7 +127,7 @@ def _sensor_width_mm(exif: Exif, sensor_width_px: int, aspect: float, warnings: 
     if crop is not None:
         warnings.append(f"the sensor's size is that of a crop factor of {crop:.4g}, from a list of cameras")
     elif exif.focal_length_35mm and exif.focal_length_mm:
-        crop = exif.focal_length_35mm / exif.focal_length_mm / (exif.digital_zoom or 1)
+        crop = exif.focal_length_35mm / exif.focal_length_mm / _zoom(exif)
         warnings.append(
             f"the sensor's size follows from the 35-mm equivalent, {exif.focal_length_35mm:g} mm for "
             f"{exif.focal_length_mm:g}, which is rounded: k_cam may be off by some percent"

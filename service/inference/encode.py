@@ -90,8 +90,10 @@ def encode_npy(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
 
 
 def encode_npz(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
-    """All maps by their names, ``K`` float64 [3, 3], NaN where the intrinsics are unknown, ``distortion`` if any."""
+    """All maps by their names, ``K`` float64 [3, 3], NaN and a warning if unknown, ``distortion`` if there is any."""
     distortion = _distortion(answer)
+    matrix = camera_matrix(answer)
+    unknown = () if np.isfinite(matrix).all() else ("the camera has no focal length in pixels: K is NaN",)
     more: dict[str, Any] = {"distortion": distortion} if distortion.any() else {}
     stream = io.BytesIO()
     np.savez(
@@ -102,10 +104,10 @@ def encode_npz(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
         sigma_m=answer.sigma_m,
         blur_px=answer.blur_px,
         valid=answer.valid,
-        K=camera_matrix(answer),
+        K=matrix,
         **more,
     )
-    return Encoded(stream.getvalue(), MEDIA_TYPES["npz"])
+    return Encoded(stream.getvalue(), MEDIA_TYPES["npz"], warnings=unknown)
 
 
 def encode_tiff(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
@@ -122,7 +124,8 @@ def encode_ply(answer: DepthMap, rgb: NDArray[np.uint8]) -> Encoded:
     """
     matrix = camera_matrix(answer)
     if not np.isfinite(matrix).all():
-        raise BadRequest("A point cloud needs the camera's focal length: register it with intrinsics or lens.")
+        detail = "A point cloud needs the camera's focal length: register it with intrinsics or lens."
+        raise BadRequest(detail, errors=(FieldProblem("format", detail),))
     v, u = np.nonzero(answer.valid)
     z = answer.depth_m[v, u]
     points = np.empty(

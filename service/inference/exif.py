@@ -34,7 +34,7 @@ class Exif:
 
 
 def read_exif(data: bytes) -> Exif:
-    """The EXIF of a photograph's file; empty where there is none, or none that can be read."""
+    """The EXIF of a photograph's file, or of the block in it; empty where there is none, or none that can be read."""
     try:
         tags = exifread.process_file(BytesIO(data), details=False, extract_thumbnail=False)
     except Exception as exc:  # its readers raise whatever a damaged file makes of their indices
@@ -66,8 +66,10 @@ def _pitch_um(tags: Mapping[str, IfdTag]) -> float | None:
 
 def _number(tags: Mapping[str, IfdTag], name: str) -> float | None:
     values = tags[name].values if name in tags else None
+    value = values[0] if isinstance(values, list) and values else math.nan
     try:
-        number = float(values[0]) if isinstance(values, list) and values else math.nan
+        # what is stored as a floating-point number comes in a tuple
+        number = float(value[0] if isinstance(value, tuple) else value)
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
         return None
     # all ones stand for infinity in a distance

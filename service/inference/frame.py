@@ -1,9 +1,11 @@
 """Whether a photograph is a camera's frame, and the camera as that photograph has it."""
 
 from service.errors import ImageSizeMismatch
+from service.inference.headers import Shot
 from service.inference.images import TURNS, Photograph
-from service.optics.camera import Camera
+from service.optics.camera import Camera, Lens
 
+LENS_TOLERANCE = 0.05
 UNTURNS = {orientation: {6: 8, 8: 6}.get(orientation, orientation) for orientation in TURNS}
 
 
@@ -14,7 +16,7 @@ def stored_camera_of(camera: Camera, width_px: int, height_px: int, orientation:
     """
     unturned = camera.turned(*TURNS[UNTURNS[orientation]])
     fitting = next((one for one in (camera, unturned) if one.is_same_frame(width_px, height_px)), None)
-    return fitting and fitting.resized(width_px, height_px)
+    return fitting and _at_size(fitting, width_px, height_px)
 
 
 def camera_of(photograph: Photograph, camera: Camera) -> tuple[Camera, tuple[str, ...]]:
@@ -31,7 +33,7 @@ def camera_of(photograph: Photograph, camera: Camera) -> tuple[Camera, tuple[str
             f"The photograph has {width_px}x{height_px} pixels upright, the camera "
             f"{camera.image_width_px}x{camera.image_height_px}: send the whole frame, not a crop."
         )
-    resized = fitting.resized(width_px, height_px)
+    resized = _at_size(fitting, width_px, height_px)
     if resized is fitting:
         return fitting, ()
     warning = (
@@ -40,3 +42,19 @@ def camera_of(photograph: Photograph, camera: Camera) -> tuple[Camera, tuple[str
         f"k_cam_px {resized.k_cam_px:.4g} and gamma_px {resized.gamma_px:.4g} were scaled to it"
     )
     return resized, (warning,)
+
+
+def other_lens(shot: Shot, lens: Lens) -> tuple[str, ...]:
+    """A warning where a photograph was not taken with the camera's lens as registered; nothing where all is alike."""
+    told = ((shot.focal_length_mm, lens.focal_length_mm, "{:g} mm"), (shot.f_number, lens.f_number, "f/{:g}"))
+    known = [(theirs, ours, form) for theirs, ours, form in told if theirs is not None]
+    if all(abs(theirs / ours - 1) <= LENS_TOLERANCE for theirs, ours, _ in known):
+        return ()
+    says = " ".join(form.format(round(theirs, 2)) for theirs, _, form in known)
+    return (f"its EXIF says {says}, the camera is {lens.focal_length_mm:g} mm f/{lens.f_number:g}",)
+
+
+def _at_size(camera: Camera, width_px: int, height_px: int) -> Camera:
+    """The camera behind its frame at another size: pixels of a smaller one average those they were made of."""
+    resize = camera.averaged if width_px < camera.image_width_px else camera.resized
+    return resize(width_px, height_px)

@@ -4,12 +4,13 @@ Each parser walks the file's structure once and believes no length that leads ou
 All raise ``InvalidImage`` for a file that is cut off or not of the form its kind prescribes.
 """
 
+import math
 import re
 import struct
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from service.errors import InvalidImage, UnsupportedKind
 from service.inference.heic import primary_picture
@@ -17,6 +18,7 @@ from service.inference.heic import primary_picture
 Kind = Literal["jpeg", "png", "tiff", "webp", "heic", "raw"]
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_READ = frozenset({b"IHDR", b"eXIf", b"acTL"})
 EXIF_SIGNATURE = b"Exif\x00\x00"
 HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"mif1"})
 JPEG_MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
@@ -25,6 +27,7 @@ JPEG_END, JPEG_SCAN, JPEG_APP1 = 0xD9, 0xDA, 0xE1
 JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 JPEG_BARE = frozenset({0x01, 0xD8, *range(0xD0, 0xD8)})
 TIFF_WIDTH, TIFF_HEIGHT, TIFF_BITS, TIFF_ORIENTATION, TIFF_SAMPLE_FORMAT = 256, 257, 258, 274, 339
+TIFF_NEW_SUBFILE = 254
 TIFF_STORES = ((273, 279), (324, 325))
 TIFF_PHOTOMETRIC, TIFF_SUB_DIRECTORIES, TIFF_DNG_VERSION = 262, 330, 50706
 # photometric interpretations of sensor values: a filter array, and the same after demosaicing
@@ -32,6 +35,9 @@ TIFF_SENSOR = frozenset({32803, 34892})
 CR2_MARK = b"CR"
 MOST_DIRECTORIES = 16
 TIFF_TYPES = {1: "B", 3: "H", 4: "I", 13: "I"}
+# with those that are no whole numbers: a rational is two
+TIFF_NUMBERS = {**TIFF_TYPES, 5: "II", 11: "f", 12: "d"}
+EXIF_DIRECTORY, EXIF_F_NUMBER, EXIF_FOCAL_LENGTH = 34665, 33437, 37386
 TIFF_MAX_VALUES = 100_000
 TIFF_MAX_ENTRIES = 4_096
 TIFF_TILE_SIZE = (322, 323)
@@ -43,13 +49,26 @@ MOST_SCANS = 64
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """Stored size in pixels, before orientation (EXIF, 1..8) is applied."""
+    """Stored size in pixels, before orientation (EXIF, 1..8) is applied; ``exif`` is the EXIF, without a signature.
+
+    Of a tiff or raw file that is the file; of a HEIC it is not looked for. ``has_more``: other pages or frames follow.
+    """
 
     kind: Kind
     width_px: int
     height_px: int
     orientation: int = 1
     orientation_offset: int | None = None
+    exif: bytes = b""
+    has_more: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """What the lens was set to; None for what is not told."""
+
+    focal_length_mm: float | None = None
+    f_number: float | None = None
 
 
 def sniff(data: bytes) -> Kind | None:
@@ -69,6 +88,8 @@ def sniff(data: bytes) -> Kind | None:
 
 def read_header(data: bytes) -> Header:
     """The header of a photograph; ``UnsupportedKind`` for anything else. What a tiff holds may be a raw file."""
+    if not data:
+        raise InvalidImage("The file is empty: send the bytes of one photograph.")
     kind = sniff(data)
     if kind is None:
         raise UnsupportedKind("The bytes are none of JPEG, PNG, TIFF, WebP, HEIC and DNG.")
@@ -92,7 +113,7 @@ def _too_many_parts(kind: str) -> InvalidImage:
 
 def _jpeg(data: bytes) -> Header:
     size: tuple[int, int] | None = None
-    orientation = 1
+    exif = b""
     scans = 0
     for marker, payload in _jpeg_segments(data):
         scans += marker == JPEG_SCAN
@@ -102,10 +123,10 @@ def _jpeg(data: bytes) -> Header:
             height, width = struct.unpack_from(">HH", payload, 1)
             size = (width, height)
         elif marker == JPEG_APP1 and payload.startswith(EXIF_SIGNATURE):
-            orientation = _exif_orientation(payload[len(EXIF_SIGNATURE) :])
+            exif = payload[len(EXIF_SIGNATURE) :]
     if size is None:
         raise InvalidImage("The jpeg file holds no picture.")
-    return Header("jpeg", *size, orientation)
+    return Header("jpeg", *size, _exif_orientation(exif), exif=exif)
 
 
 def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
@@ -133,14 +154,16 @@ def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _png(data: bytes) -> Header:
-    size = (0, 0)
-    orientation = 1
+    size, frames = (0, 0), 1
+    exif = b""
     for name, payload in _png_chunks(data):
         if name == b"IHDR":
             size = struct.unpack_from(">II", payload)
         elif name == b"eXIf":
-            orientation = _exif_orientation(payload)
-    return Header("png", *size, orientation)
+            exif = payload
+        elif name == b"acTL":
+            frames = int.from_bytes(payload[:4], "big")
+    return Header("png", *size, _exif_orientation(exif), exif=exif, has_more=frames > 1)
 
 
 def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
@@ -152,7 +175,7 @@ def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
         (checksum,) = struct.unpack_from(">I", data, end)
         if zlib.crc32(memoryview(data)[at + 4 : end]) != checksum:
             raise InvalidImage(f"The png file is damaged: its {name.decode('latin-1')!r} part fails its checksum.")
-        yield name, data[at + 8 : end] if name in (b"IHDR", b"eXIf") else b""
+        yield name, data[at + 8 : end] if name in PNG_READ else b""
         at = end + 4
         if name == b"IEND":
             return
@@ -164,21 +187,23 @@ def _webp(data: bytes) -> Header:
     if length + 8 > len(data):
         raise cut_off("webp")
     size: tuple[int, int] | None = None
-    orientation = 1
+    exif = b""
+    frames = 0
     at = 12
     for _ in range(MOST_PARTS):
         if at > length:
             break
         name, chunk = struct.unpack_from("<4sI", data, at)
         size = size or _webp_size(name, data[at + 8 : at + 18])
+        frames += name == b"ANMF"
         if name == b"EXIF":
-            orientation = _exif_orientation(data[at + 8 : at + 8 + chunk].removeprefix(EXIF_SIGNATURE))
+            exif = data[at + 8 : at + 8 + chunk].removeprefix(EXIF_SIGNATURE)
         at += 8 + chunk + chunk % 2
     else:
         raise _too_many_parts("webp")
     if size is None:
         raise InvalidImage("The webp file holds no picture.")
-    return Header("webp", *size, orientation)
+    return Header("webp", *size, _exif_orientation(exif), exif=exif, has_more=frames > 1)
 
 
 def _webp_size(name: bytes, payload: bytes) -> tuple[int, int] | None:
@@ -198,14 +223,23 @@ def _tiff(data: bytes) -> Header:
     directory.require_stored()
     sensor = _sensor_size(data, directory)
     if sensor is not None:
-        return Header("raw", *sensor, directory.orientation())
+        return Header("raw", *sensor, directory.orientation(), exif=data)
     if 3 in directory.values(TIFF_SAMPLE_FORMAT):
         raise UnsupportedKind("A tiff of floating-point numbers is no photograph: send 8 or 16 bits, sRGB.")
     if not set(directory.values(TIFF_BITS)) <= {8, 16}:
         raise UnsupportedKind("A tiff must have 8 or 16 bits a channel.")
     _require_tiles(directory)
     at = directory.offset_of(TIFF_ORIENTATION)
-    return Header("tiff", *directory.size, directory.orientation(), at)
+    return Header("tiff", *directory.size, directory.orientation(), at, data, _has_more_pages(data, directory))
+
+
+def _has_more_pages(data: bytes, first: "_TiffDirectory") -> bool:
+    """Whether pages follow; a smaller copy of the first is none."""
+    try:
+        pages = [_TiffDirectory(data, start) for start in first.following(MOST_DIRECTORIES)]
+        return not all(1 & next(iter(page.values(TIFF_NEW_SUBFILE)), 0) for page in pages)
+    except (struct.error, InvalidImage):
+        return False
 
 
 def _require_tiles(directory: "_TiffDirectory") -> None:
@@ -238,6 +272,18 @@ def _exif_orientation(data: bytes) -> int:
         return _TiffDirectory(data).orientation()
     except (struct.error, InvalidImage):
         return 1
+
+
+def read_shot(exif: bytes) -> Shot:
+    """What an EXIF block says of the lens, two numbers at most; one that cannot be read says nothing."""
+    try:
+        start = next(iter(_TiffDirectory(exif).values(EXIF_DIRECTORY)), None)
+        if start is None:
+            return Shot()
+        directory = _TiffDirectory(exif, start)
+        return Shot(directory.number(EXIF_FOCAL_LENGTH), directory.number(EXIF_F_NUMBER))
+    except (struct.error, InvalidImage):
+        return Shot()
 
 
 class _TiffDirectory:
@@ -283,7 +329,7 @@ class _TiffDirectory:
             if any(offset + count > len(self._data) for offset, count in stored):
                 raise cut_off("tiff")
 
-    def _unpack(self, form: str, at: int) -> tuple[int, ...]:
+    def _unpack(self, form: str, at: int) -> tuple[Any, ...]:
         return struct.unpack_from(self._order + form, self._data, at)
 
     def offset_of(self, tag: int) -> int | None:
@@ -292,7 +338,7 @@ class _TiffDirectory:
         if entry is None:
             return None
         kind, count = self._unpack("HI", entry + 2)
-        size = struct.calcsize("=" + TIFF_TYPES.get(kind, "I")) * count
+        size = struct.calcsize("=" + TIFF_NUMBERS.get(kind, "I")) * count
         return entry + 8 if size <= 4 else self._unpack("I", entry + 8)[0]
 
     def values(self, tag: int) -> tuple[int, ...]:
@@ -306,6 +352,18 @@ class _TiffDirectory:
         if count > TIFF_MAX_VALUES:
             raise InvalidImage(f"The tiff file states {count} values for tag {tag}.")
         return self._unpack(f"{count}{TIFF_TYPES[kind]}", at)
+
+    def number(self, tag: int) -> float | None:
+        """A tag's first number, of any type; None without one that is positive and finite."""
+        at = self.offset_of(tag)
+        if at is None:
+            return None
+        (kind,) = self._unpack("H", self._entries[tag] + 2)
+        if kind not in TIFF_NUMBERS:
+            return None
+        over, *under = self._unpack(TIFF_NUMBERS[kind], at)
+        value = over / (under[0] or math.nan) if under else over
+        return value if 0 < value < math.inf else None
 
     def orientation(self) -> int:
         value = next(iter(self.values(TIFF_ORIENTATION)), 1)

@@ -5,7 +5,7 @@ here and nowhere else; a calibration, which measures the lens, asks for the stor
 decoded in a process of their own.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from service import PIXEL_CEILING
 from service.config import Settings
 from service.errors import InvalidImage, TooLarge, UnsupportedKind
-from service.inference.headers import Header, Kind, read_header
+from service.inference.headers import Header, Kind, Shot, read_header, read_shot
 from service.inference.isolated import decode_isolated
 from service.opencv import cv2
 
@@ -30,6 +30,9 @@ MEDIA_TYPES: dict[str, Kind] = {
     "image/x-nikon-nef": "raw",
     "image/x-sony-arw": "raw",
 }
+# what some browsers and programs call them
+ALIASES: dict[str, Kind] = {"image/jpg": "jpeg", "image/pjpeg": "jpeg", "image/x-png": "png"}
+CURL_S_OWN = "application/x-www-form-urlencoded"
 UNDECLARED = frozenset({"", "application/octet-stream", "image/*"})
 
 # (transposed, flipped left-right, flipped top-bottom), in this order, by EXIF orientation
@@ -71,6 +74,7 @@ class Photograph:
     stored_width_px: int
     stored_height_px: int
     warnings: tuple[str, ...] = ()
+    shot: Shot = field(default_factory=Shot)
 
     @property
     def width_px(self) -> int:
@@ -88,10 +92,14 @@ def read_photograph(data: bytes, media_type: str | None = None, limits: ImageLim
     (a declared type or bytes that are not listed).
     """
     declared = declared_kind(media_type)
-    kind, stored, orientation = _read(data, limits or ImageLimits())
-    warnings = (f"declared {media_type}, read as {kind}",) if declared not in (None, kind) else ()
+    header, stored = _read(data, limits or ImageLimits())
+    kind, orientation = header.kind, header.orientation
+    warnings: tuple[str, ...] = (f"declared {media_type}, read as {kind}",) if declared not in (None, kind) else ()
+    if header.has_more:
+        warnings += ("the file has more than one picture: the first was read",)
     height, width = stored.shape[:2]
-    return Photograph(turned(stored, orientation), kind, orientation, width, height, warnings)
+    upright = turned(stored, orientation)
+    return Photograph(upright, kind, orientation, width, height, warnings, read_shot(header.exif))
 
 
 def read_stored_frame(data: bytes, limits: ImageLimits | None = None) -> NDArray[np.uint8]:
@@ -119,14 +127,15 @@ def declared_kind(media_type: str | None) -> Kind | None:
     name = (media_type or "").partition(";")[0].strip().lower()
     if name in UNDECLARED:
         return None
-    if name not in MEDIA_TYPES:
+    if name == CURL_S_OWN:
+        raise UnsupportedKind(f"{name} is what curl says of any body: add -H 'Content-Type: image/jpeg'.")
+    kind = MEDIA_TYPES.get(name) or ALIASES.get(name)
+    if kind is None:
         raise UnsupportedKind(f"{name[:100]} is no photograph: send one of {', '.join(MEDIA_TYPES)}.")
-    return MEDIA_TYPES[name]
+    return kind
 
 
-def _read(data: bytes, limits: ImageLimits) -> tuple[Kind, NDArray[np.uint8], int]:
-    if not data:
-        raise InvalidImage("The file is empty: send the bytes of one photograph.")
+def _read(data: bytes, limits: ImageLimits) -> tuple[Header, NDArray[np.uint8]]:
     if len(data) > limits.max_bytes:
         raise TooLarge(f"The file has {len(data)} bytes, more than the {limits.max_bytes} accepted.")
     header = read_header(data)
@@ -138,7 +147,7 @@ def _read(data: bytes, limits: ImageLimits) -> tuple[Kind, NDArray[np.uint8], in
             stored = _unturned_pixels(stored, header)
     else:
         stored = _decode(data, header)
-    return header.kind, stored, header.orientation
+    return header, stored
 
 
 def _require_size(width_px: int, height_px: int, limits: ImageLimits) -> None:

@@ -124,7 +124,7 @@ class Camera:
         aspect = (width_px / height_px) / (self.image_width_px / self.image_height_px)
         # one pixel of rounding is no crop, however small the copy is
         rounding = 0.5 / width_px + 0.5 / height_px
-        return abs(aspect - 1) <= ASPECT_TOLERANCE + rounding
+        return abs(aspect - 1) <= max(ASPECT_TOLERANCE, rounding)
 
     def resized(self, width_px: int, height_px: int) -> "Camera":
         """The camera behind the same frame at another size: k_cam, gamma and intrinsics scale, x does not."""

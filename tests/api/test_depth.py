@@ -25,7 +25,7 @@ from service.inference.worker import Worker
 from service.opencv import cv2
 from service.optics import thin_lens
 from tests.inference.oracle_pair import blur_of
-from tests.inference.photographs import corners, hostile_png, jpeg, png, tiff, webp
+from tests.inference.photographs import corners, exif_of, hostile_png, jpeg, png, tiff, webp, with_exif
 
 CAMERA = {
     "name": "bench",
@@ -134,6 +134,16 @@ def test_json_has_exactly_the_numbers_of_the_design(bench: TestClient) -> None:
     assert point["sigma_m"] > 0
 
 
+@pytest.mark.parametrize(
+    ("at", "u", "v"),
+    [("32.1234567890,21", 32.123456789, 21), ("1e1,2", 10, 2), ("1, 2", 1, 2), (".5,1.", 0.5, 1), ("+3,4e-1", 3, 0.4)],
+)
+def test_a_number_may_be_written_in_any_way(bench: TestClient, at: str, u: float, v: float) -> None:
+    (point,) = ask(bench, format="json", at=at).json()["points"]
+    assert (point["u"], point["v"]) == (u, v)
+    assert ask(bench, known=f"{at}, 1.1000000000").status_code == 200
+
+
 def test_json_says_null_and_never_nan(bench: TestClient) -> None:
     response = ask(bench, png(grey(230)), format="json", at="3,3", side="auto")
     assert b"NaN" not in response.content
@@ -191,6 +201,26 @@ def test_every_kind_of_photograph_is_taken(bench: TestClient, make: Any) -> None
     np.testing.assert_allclose(npy(response), depth_near(LEVEL), rtol=0.01)
 
 
+@pytest.mark.parametrize(
+    ("kind", "make"), [("image/jpg", jpeg), ("image/pjpeg", jpeg), ("image/x-png", png), ("IMAGE/JPG; q=1", jpeg)]
+)
+def test_a_kind_may_go_by_another_name(bench: TestClient, kind: str, make: Any) -> None:
+    files = {"image": ("a", make(grey()), kind)}
+    for response in (ask(bench, make(grey()), {"Content-Type": kind}), bench.post("/depth?camera=bench", files=files)):
+        assert response.status_code == 200, response.text
+        assert "declared" not in response.headers["Camind-Warnings"]
+
+
+def test_without_a_focal_length_there_is_no_point_cloud_and_no_camera_matrix(client: TestClient) -> None:
+    client.post("/cameras", json={name: value for name, value in CAMERA.items() if name != "intrinsics"})
+    problem = refused(ask(client, format="ply"), 422, "focal length")
+    assert problem["errors"][0]["pointer"] == "format"
+    response = ask(client, format="npz")
+    assert "K is NaN" in response.headers["Camind-Warnings"]
+    with np.load(io.BytesIO(response.content)) as stored:
+        assert np.isnan(stored["K"][0, 0])
+
+
 def test_an_upright_phone_photograph_is_answered_upright(bench: TestClient) -> None:
     stored = grey(30)
     stored[:, :48] = 120
@@ -204,7 +234,9 @@ def test_an_upright_phone_photograph_is_answered_upright(bench: TestClient) -> N
 
 def test_a_resized_frame_rescales_the_camera_and_warns(bench: TestClient) -> None:
     response = ask(bench, png(grey(60, 32, 48)), format="npy")
-    np.testing.assert_allclose(npy(response), depth_near(60, 3.0, 0.25), rtol=1e-3)
+    np.testing.assert_allclose(
+        npy(response), depth_near(60, 3.0, thin_lens.gamma_after_averaging(0.5, 96, 48)), rtol=1e-3
+    )
     warning = response.headers["Camind-Warnings"]
     assert "48x32" in warning
     assert "96x64" in warning
@@ -230,6 +262,15 @@ def test_a_lens_moves_focus_exactly_but_not_nearer_than_its_focal_length(
         assert stored["K"][0, 0] == pytest.approx(35e3 / 6.05 * 645 / 3872)
     problem = refused(ask(client, picture, camera="d200", focus_distance_m=0.03), 422, "focal length")
     assert problem["errors"][0]["pointer"] == "focus_distance_m"
+
+
+def test_a_photograph_by_another_lens_is_warned_of(client: TestClient, d200: dict[str, Any]) -> None:
+    client.post("/cameras", json=d200)
+    client.post("/cameras", json={**CAMERA, "image_width_px": 645, "image_height_px": 432})
+    other = with_exif(jpeg(grey(60, 432, 645)), exif_of({}, {0x920A: (50, 1), 0x829D: (12, 10)}))
+    warned = ask(client, other, {"Content-Type": "image/jpeg"}, camera="d200").headers["Camind-Warnings"]
+    assert warned == "its EXIF says 50 mm f/1.2, the camera is 35 mm f/2.8"
+    assert "EXIF" not in ask(client, other).headers["Camind-Warnings"]
 
 
 def test_known_depths_tell_where_this_shot_was_focused(bench: TestClient) -> None:
@@ -272,7 +313,11 @@ def test_known_depths_are_of_the_whole_whatever_part_is_asked_for(bench: TestCli
         ({"known": "3,4,inf"}, "u,v,depth_m"),
         ({"known": "3,4,123456"}, "u,v,depth_m"),
         ({"known": ["3,4,1.5"] * 101}, "100"),
-        ({"roi": "1,2,3"}, "roi"),
+        ({"known": "3,4,nan"}, "u,v,depth_m"),
+        ({"at": "1e7,1"}, "u,v"),
+        ({"at": "1," + "0" * 200}, "u,v"),
+        ({"roi": "1,2,3"}, "four whole numbers of pixels, u0,v0,u1,v1"),
+        ({"focus_distance_m": "two"}, "this must be a number"),
         ({"roi": "-1,2,3,4"}, "roi"),
         ({"colour": "red"}, "colour"),
     ],
@@ -294,6 +339,7 @@ def test_an_unknown_camera_is_404(bench: TestClient) -> None:
         (b"this is a letter, not a picture", "image/jpeg", 415, "JPEG"),
         (png(corners()), "text/plain", 415, "text/plain"),
         (png(corners()), "application/json", 415, "application/json"),
+        (png(corners()), "application/x-www-form-urlencoded", 415, "add -H 'Content-Type: image/jpeg'"),
         (b"GIF89a" + bytes(60), "image/gif", 415, "image/gif"),
         (bytes(2_000_001), "image/png", 413, "2000000"),
     ],

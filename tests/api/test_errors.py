@@ -132,6 +132,66 @@ def test_nothing_sent_is_echoed(client: TestClient, phone: dict[str, Any]) -> No
     assert typed not in answer.text
 
 
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"name": "no name"}, "a name has letters, digits, dots, dashes and underscores, 64 at most"),
+        ({"name": 7}, "this must be a text"),
+        ({"k_cam_px": "7"}, "this must be a number"),
+        ({"image_width_px": 7.5}, "this must be a whole number"),
+        ({"description": "\x00"}, "no control characters"),
+    ],
+)
+def test_a_fault_is_told_in_words_and_not_by_a_pattern(
+    client: TestClient, phone: dict[str, Any], changes: dict[str, Any], words: str
+) -> None:
+    (fault,) = require_problem(client.post("/cameras", json={**phone, **changes}), 422, "invalid-request")["errors"]
+    assert fault["pointer"] == f"#/{next(iter(changes))}"
+    assert words in fault["detail"]
+
+
+def test_headers_and_parameters_are_told_of_in_words_too(client: TestClient, phone: dict[str, Any]) -> None:
+    spaced = client.post("/cameras", json=phone, headers={"Idempotency-Key": "a b"})
+    assert "no spaces" in require_problem(spaced, 422, "invalid-request")["detail"]
+    named = client.post("/calibrate", params={"camera": "-"})
+    assert "a name has letters" in require_problem(named, 422, "invalid-request")["detail"]
+    assert "whole number" in require_problem(client.get("/cameras?limit=x"), 422, "invalid-request")["detail"]
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "query", "name", "words"),
+    [
+        ("GET", "/cameras", "limits=2", "limits", "no such"),
+        ("GET", "/cameras", "limit=1&limit=2", "limit", "once"),
+        ("GET", "/cameras/x", "points=2", "points", "no such"),
+        ("GET", "/cameras/x/curve", "near=1", "near", "no such"),
+        ("GET", "/cameras/x/curve", "name=x", "name", "no such"),
+        ("GET", "/cameras/x/curve", "near_m=1&near_m=2", "near_m", "once"),
+        ("GET", "/calibrations", "page=2", "page", "no such"),
+        ("GET", "/calibrate/target.svg", "row=3", "row", "no such"),
+        ("GET", "/calibrate/target.pdf", "rows=3&rows=4", "rows", "once"),
+        ("POST", "/calibrate/look", "roi=1", "roi", "no such"),
+        ("POST", "/photographs/preview", "longest_px=99&longest_px=98", "longest_px", "once"),
+        ("POST", "/depth", "camera=a&camera=b", "camera", "once"),
+        ("POST", "/depth", "camera=a&focus_distance_m=1&focus_distance_m=2", "focus_distance_m", "once"),
+        ("POST", "/depth", "camera=a&query=1", "query", "no such"),
+        ("DELETE", "/cameras/x", "if-match=1", "if-match", "no such"),
+    ],
+)
+def test_a_parameter_that_is_unknown_or_sent_twice_is_named(
+    client: TestClient, method: str, path: str, query: str, name: str, words: str
+) -> None:
+    body = require_problem(client.request(method, f"{path}?{query}"), 422, "invalid-request")
+    (fault,) = body["errors"]
+    assert fault["pointer"] == name
+    assert words in fault["detail"]
+
+
+def test_a_page_s_address_may_have_any_query(client: TestClient) -> None:
+    for path in ("/", "/health/live", "/model", "/web/app.js"):
+        assert client.get(f"{path}?from=mail&from=mail").status_code == 200
+
+
 def test_a_lone_surrogate_breaks_nothing(client: TestClient) -> None:
     answer = client.post("/cameras", content=b'{"\\ud800": 1, "name": "\\udfff"}', headers=JSON)
     require_problem(answer, 422, "invalid-request")

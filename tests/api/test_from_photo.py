@@ -4,7 +4,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from service.optics.camera import Lens
-from tests.inference.photographs import ExifTags, corners, exif_of, jpeg, with_exif
+from tests.inference.photographs import ExifTags, corners, exif_of, jpeg, webp, with_exif
 
 MAIN: ExifTags = {271: "NIKON CORPORATION", 272: "NIKON D200"}
 SHOT: ExifTags = {0x829D: (28, 10), 0x920A: (35, 1), 0xA002: 3872, 0xA405: 52}
@@ -34,8 +34,15 @@ def test_a_form_is_as_good(client: TestClient) -> None:
     assert answer.json()["name"] == "nikon-d200-35mm-f2.8"
 
 
+def test_a_webp_tells_as_much(client: TestClient) -> None:
+    content = webp(corners(432, 645), exif=exif_of(MAIN, SHOT, PLACE))
+    answer = client.post(PATH, content=content, headers={"Content-Type": "image/webp"})
+    assert answer.json() == client.post(PATH, content=PHOTOGRAPH, headers={"Content-Type": "image/jpeg"}).json()
+
+
 def test_what_is_no_photograph_is_refused(client: TestClient) -> None:
     for content, kind, status in (
+        (b"", "image/jpeg", 422),
         (b"x", "image/jpeg", 415),
         (b"{}", "application/json", 415),
         (PHOTOGRAPH[:2000], "image/jpeg", 422),

@@ -12,7 +12,7 @@ from service.opencv import cv2
 
 Pixels = NDArray[Any]
 Order = Literal["<", ">"]
-ExifValue = int | str | tuple[int, int]
+ExifValue = int | float | str | tuple[int, int]
 ExifTags = Mapping[int, ExifValue]
 
 
@@ -43,7 +43,7 @@ def exif_block(orientation: int, order: Order = "<") -> bytes:
 
 
 def exif_of(main: ExifTags, shot: ExifTags, place: ExifTags | None = None) -> bytes:
-    """A TIFF structure with these tags in its main, EXIF and GPS directories: whole numbers, text and rationals."""
+    """A TIFF structure with these tags in its main, EXIF and GPS directories: numbers, text and rationals."""
     out = bytearray(b"II*\x00\x00\x00\x00\x00")
     pointers: dict[int, ExifValue] = {0x8769: _add_directory(out, shot)}
     if place:
@@ -58,8 +58,7 @@ def _add_directory(out: bytearray, tags: ExifTags) -> int:
         if isinstance(value, int):
             entries += struct.pack("<HHII", tag, 4, 1, value)
             continue
-        stored = value.encode() + b"\x00" if isinstance(value, str) else struct.pack("<II", *value)
-        kind, count = (2, len(stored)) if isinstance(value, str) else (5, 1)
+        kind, count, stored = _stored(value)
         if len(stored) <= 4:
             entries += struct.pack("<HHI", tag, kind, count) + stored.ljust(4, b"\x00")
         else:
@@ -68,6 +67,14 @@ def _add_directory(out: bytearray, tags: ExifTags) -> int:
     offset = len(out)
     out += struct.pack("<H", len(tags)) + entries + struct.pack("<I", 0)
     return offset
+
+
+def _stored(value: float | str | tuple[int, int]) -> tuple[int, int, bytes]:
+    """Type, count and bytes of a value that has no place in its entry."""
+    if isinstance(value, str):
+        text = value.encode() + b"\x00"
+        return 2, len(text), text
+    return (12, 1, struct.pack("<d", value)) if isinstance(value, float) else (5, 1, struct.pack("<II", *value))
 
 
 def with_exif(data: bytes, exif: bytes) -> bytes:
@@ -94,16 +101,17 @@ def png(rgb: Pixels, orientation: int | None = None) -> bytes:
     return data[:33] + png_chunk(b"eXIf", exif_block(orientation)) + data[33:]
 
 
-def webp(rgb: Pixels, orientation: int | None = None) -> bytes:
-    """A lossless WebP, with an EXIF orientation if one is given."""
+def webp(rgb: Pixels, orientation: int | None = None, exif: bytes | None = None) -> bytes:
+    """A lossless WebP, with an EXIF orientation or EXIF block if one is given."""
     data = encoded(".webp", rgb, cv2.IMWRITE_WEBP_QUALITY, 101)
-    if orientation is None:
+    if orientation is not None:
+        exif = exif_block(orientation)
+    if exif is None:
         return data
     start = data.index(b"VP8L")
-    exif = exif_block(orientation)
     size: bytes = (rgb.shape[1] - 1).to_bytes(3, "little") + (rgb.shape[0] - 1).to_bytes(3, "little")
     extended = b"VP8X" + struct.pack("<I", 10) + b"\x08\x00\x00\x00" + size
-    chunks = extended + data[start:] + b"EXIF" + struct.pack("<I", len(exif)) + exif
+    chunks = extended + data[start:] + b"EXIF" + struct.pack("<I", len(exif)) + exif + bytes(len(exif) % 2)
     return b"RIFF" + struct.pack("<I", len(chunks) + 4) + b"WEBP" + chunks
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from service.inference.drafting import Draft, draft_camera
 from service.inference.exif import Exif, read_exif
+from service.inference.headers import read_header
 from service.storage.cameras import NAME_PATTERN
 from tests.inference.photographs import ExifValue, corners, exif_of, jpeg, png, tiff, webp, with_exif
 
@@ -20,7 +21,7 @@ SHOT: dict[int, ExifValue] = {F_NUMBER: (28, 10), FOCAL: (350, 10), FOCAL_35: 52
 D200 = Exif("NIKON CORPORATION", "NIKON D200", None, 35.0, 52.0, 2.8, None, None, 3872, None)
 
 
-def draft(width_px: int = 3872, height_px: int = 2592, **tags: Any) -> Draft:
+def draft(width_px: int = 3872, height_px: int = 2592, /, **tags: Any) -> Draft:
     return draft_camera(replace(D200, **tags), width_px, height_px)
 
 
@@ -35,6 +36,17 @@ def test_tags_are_read_from_a_jpeg_s_exif() -> None:
         D200, lens="35mm f/2", subject_distance_m=2.0, digital_zoom=1.0
     )
     assert found.focal_plane_pitch_um == pytest.approx(1e4 / 4164)
+
+
+@pytest.mark.parametrize("prefix", [b"", b"Exif\x00\x00"])
+def test_tags_are_read_from_a_webp_of_either_form(prefix: bytes) -> None:
+    found = read_exif(read_header(webp(corners(), exif=prefix + exif_of(NIKON, SHOT))).exif)
+    assert found == D200
+
+
+def test_numbers_with_a_floating_point_are_read() -> None:
+    found = read_exif(with_exif(jpeg(corners()), exif_of({}, {F_NUMBER: 1.8, FOCAL: 35.0, SUBJECT: 2.5, ZOOM: 1.0})))
+    assert (found.f_number, found.focal_length_mm, found.subject_distance_m, found.digital_zoom) == (1.8, 35, 2.5, 1)
 
 
 @pytest.mark.parametrize("data", [b"", b"x", jpeg(corners()), png(corners()), tiff(corners()), webp(corners())])
@@ -84,8 +96,30 @@ def test_the_equivalent_tells_the_sensor_but_is_no_focal_length() -> None:
 
 def test_a_digital_zoom_is_taken_out_of_the_equivalent_and_told() -> None:
     zoomed = draft(make="Nobody", model="Nothing 1", focal_length_35mm=104.0, digital_zoom=2.0)
-    assert zoomed.lens.pixel_pitch_um == pytest.approx(6.05, rel=0.05)
+    assert zoomed.lens.pixel_pitch_um == pytest.approx(6.05 / 2, rel=0.05)
     assert said(zoomed, "digital zoom")
+
+
+@pytest.mark.parametrize("tags", [{}, {"focal_plane_pitch_um": 6.05}, {"focal_plane_pitch_um": 6.05, "width_px": None}])
+def test_a_zoomed_picture_s_pixels_are_so_much_smaller_ones_of_the_sensor(tags: dict[str, Any]) -> None:
+    whole, zoomed = draft(**tags).lens, draft(digital_zoom=2.0, **tags).lens
+    assert zoomed.sensor_width_px == whole.sensor_width_px == 3872
+    assert whole.pixel_pitch_um is not None
+    assert zoomed.pixel_pitch_um == pytest.approx(whole.pixel_pitch_um / 2, rel=1e-3)
+
+
+@pytest.mark.parametrize("width_px", [None, 400])
+def test_a_sensor_as_wide_as_its_picture_is_drafted_only_where_something_says_so(width_px: int | None) -> None:
+    unknown = draft(645, 432, make=None, model=None, focal_length_35mm=None, width_px=width_px)
+    assert (unknown.lens.pixel_pitch_um, unknown.lens.sensor_width_px) == (None, None)
+    assert said(unknown, "lens.sensor_width_px is needed")
+    assert draft(3872, 2592, make=None, model=None, focal_length_35mm=None).lens.sensor_width_px == 3872
+    listed = draft(645, 432, width_px=width_px)
+    assert listed.lens.pixel_pitch_um == pytest.approx(6.05 * 3872 / 645, rel=0.01)
+    assert (listed.lens.sensor_width_px, said(listed, "sensor_width_px is needed")) == (645, False)
+    bare: dict[str, Any] = {"make": None, "model": None, "focal_length_35mm": None, "width_px": width_px}
+    pitched = draft(645, 432, **bare, focal_plane_pitch_um=6.0)
+    assert (pitched.lens.pixel_pitch_um, pitched.lens.sensor_width_px) == (6.0, None)
 
 
 def test_a_file_made_small_belongs_to_the_whole_sensor() -> None:
@@ -116,8 +150,9 @@ def test_a_ring_counts_from_the_sensor_and_the_draft_says_what_that_is_from_the_
 def test_without_exif_everything_is_missing_and_named() -> None:
     drafted = draft_camera(Exif(), 640, 480)
     assert (drafted.name, drafted.description) == ("camera", None)
-    assert (drafted.image_width_px, drafted.image_height_px, drafted.lens.sensor_width_px) == (640, 480, 640)
-    for field in ("focus_distance_m", "lens.focal_length_mm", "lens.f_number", "lens.pixel_pitch_um"):
+    assert (drafted.image_width_px, drafted.image_height_px, drafted.lens.sensor_width_px) == (640, 480, None)
+    needed = ("focal_length_mm", "f_number", "pixel_pitch_um", "sensor_width_px")
+    for field in ("focus_distance_m", *(f"lens.{name}" for name in needed)):
         assert said(drafted, f"{field} is needed")
 
 

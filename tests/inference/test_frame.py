@@ -5,10 +5,12 @@ import pytest
 from numpy.typing import NDArray
 
 from service.errors import ImageSizeMismatch
-from service.inference.frame import camera_of
+from service.inference.frame import camera_of, other_lens
+from service.inference.headers import Shot
 from service.inference.images import TURNS, Photograph, turned
 from service.opencv import cv2
-from service.optics.camera import Camera, Intrinsics
+from service.optics import thin_lens
+from service.optics.camera import Camera, Intrinsics, Lens
 
 DISTORTION = (-0.1, 0.02, 0.003, -0.005, 0.001, 0.01, 0.002, 0.001, 0.004, -0.003, 0.002, 0.005)
 INTRINSICS = Intrinsics(500.0, 520.0, 300.0, 210.0, DISTORTION)
@@ -64,8 +66,30 @@ def test_a_camera_registered_by_its_upright_size_takes_it_too() -> None:
 def test_a_resized_frame_scales_the_blur_constants_and_says_so(orientation: int) -> None:
     camera, warnings = camera_of(photograph(320, 240, orientation), CAMERA)
     assert camera.k_cam_px == pytest.approx(3.0)
-    assert camera.gamma_px == pytest.approx(0.25)
+    assert camera.gamma_px == pytest.approx(thin_lens.gamma_after_averaging(0.5, 640, 320))
+    assert camera.gamma_px**2 > thin_lens.PIXEL_BOX_VARIANCE > 0.25**2
     assert "k_cam_px 3" in warnings[0]
+    assert f"gamma_px {camera.gamma_px:.4g}" in warnings[0]
+
+
+def test_a_frame_made_larger_scales_gamma_alike() -> None:
+    camera, _ = camera_of(photograph(1280, 960), CAMERA)
+    assert (camera.k_cam_px, camera.gamma_px) == pytest.approx((12.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("shot", "words"),
+    [
+        (Shot(35.0, 2.8), "its EXIF says 35 mm f/2.8, the camera is 50 mm f/1.2"),
+        (Shot(50.0, 1.8), "its EXIF says 50 mm f/1.8, the camera is 50 mm f/1.2"),
+        (Shot(None, 1.8), "its EXIF says f/1.8, the camera is 50 mm f/1.2"),
+        (Shot(53.0), "its EXIF says 53 mm, the camera is 50 mm f/1.2"),
+        (Shot(52.0, 1.25), ""),
+        (Shot(), ""),
+    ],
+)
+def test_a_lens_that_is_not_the_camera_s_is_told(shot: Shot, words: str) -> None:
+    assert " ".join(other_lens(shot, Lens(50, 1.2, 6.0, 4000))) == words
 
 
 @pytest.mark.parametrize(("width", "height"), [(640, 400), (480, 640), (641, 300)])

@@ -2,6 +2,7 @@
 
 import resource
 import struct
+import time
 from collections.abc import Callable
 from io import BytesIO
 
@@ -10,15 +11,29 @@ import pytest
 import tifffile
 
 from service.errors import InvalidImage, TooLarge, UnsupportedKind
-from service.inference.headers import MOST_PARTS, MOST_SCANS, read_header
+from service.inference.headers import MOST_PARTS, MOST_SCANS, Shot, read_header, read_shot
 from service.inference.images import TURNS, ImageLimits, read_photograph, read_stored_frame
 from service.opencv import cv2
-from tests.inference.photographs import Order, corners, encoded, hostile_png, jpeg, png, png_chunk, tiff, webp
+from tests.inference.photographs import (
+    ExifValue,
+    Order,
+    corners,
+    encoded,
+    exif_of,
+    hostile_png,
+    jpeg,
+    png,
+    png_chunk,
+    tiff,
+    webp,
+    with_exif,
+)
 
 MAKERS: dict[str, Callable[..., bytes]] = {"jpeg": jpeg, "png": png, "tiff": tiff, "webp": webp}
 # corners as they must appear upright: top left, top right, bottom left, bottom right
 UPRIGHT = {1: "rgbw", 2: "grwb", 3: "wbgr", 4: "bwrg", 5: "rbgw", 6: "brwg", 7: "wgbr", 8: "gwrb"}
 COLOURS = {"r": (255, 0, 0), "g": (0, 255, 0), "b": (0, 0, 255), "w": (255, 255, 255)}
+FOCAL, APERTURE = 0x920A, 0x829D
 
 
 @pytest.mark.parametrize("orientation", TURNS)
@@ -214,3 +229,64 @@ def test_a_small_file_of_a_huge_picture_costs_no_memory() -> None:
         read_photograph(data, "image/png")
     grown_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kb
     assert grown_kb < 20_000
+
+
+@pytest.mark.parametrize("value", [(358, 10), 35.8])
+def test_what_the_lens_was_set_to_is_read_from_every_kind_of_file(value: ExifValue) -> None:
+    exif = exif_of({}, {FOCAL: value, APERTURE: (28, 10)})
+    chunked = png(corners())[:33] + png_chunk(b"eXIf", exif) + png(corners())[33:]
+    for data in (with_exif(jpeg(corners()), exif), webp(corners(), exif=exif), chunked):
+        assert read_photograph(data).shot == Shot(35.8, 2.8)
+    assert read_photograph(jpeg(corners())).shot == Shot()
+
+
+@pytest.mark.parametrize("value", [(0, 1), (0, 0), (5, 0), -1.0, float("nan"), float("inf"), "35"])
+def test_a_setting_that_is_no_number_is_not_told(value: ExifValue) -> None:
+    data = with_exif(jpeg(corners()), exif_of({}, {FOCAL: value, APERTURE: value}))
+    assert read_photograph(data).shot == Shot()
+
+
+def test_what_the_lens_was_set_to_is_read_at_once_and_no_damage_stops_it() -> None:
+    exif = exif_of({271: "x" * 40, 272: "y" * 40}, {FOCAL: 35.0, APERTURE: 2.8})
+    started = time.perf_counter()
+    for _ in range(100):
+        assert read_shot(exif) == Shot(35.0, 2.8)
+    assert time.perf_counter() - started < 0.1
+    for length in range(len(exif)):
+        read_shot(exif[:length])
+
+
+def pages(*subfiles: int) -> bytes:
+    """A tiff of the corners and more pages, each of a kind (1: a smaller copy)."""
+    out = BytesIO()
+    with tifffile.TiffWriter(out) as writer:
+        for kind in (0, *subfiles):
+            writer.write(corners(), photometric="rgb", subfiletype=kind, metadata=None)
+    return out.getvalue()
+
+
+def animated(kind: str, frames: int) -> bytes:
+    """So many frames, the first of the corners."""
+    animation = cv2.Animation()
+    animation.frames = [np.ascontiguousarray(corners()[..., ::-1]), *([np.zeros((48, 64, 3), np.uint8)] * (frames - 1))]
+    animation.durations = [100] * frames
+    is_written, body = cv2.imencodeanimation(kind, animation)
+    assert is_written
+    return body.tobytes()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [pages(0), pages(1, 0), animated(".webp", 3), animated(".png", 2)],
+    ids=["tiff", "tiff with a copy", "webp", "png"],
+)
+def test_of_several_pictures_the_first_is_read_and_that_is_told(data: bytes) -> None:
+    photograph = read_photograph(data)
+    assert photograph.warnings == ("the file has more than one picture: the first was read",)
+    assert photograph.rgb[4, 4].argmax() == 0
+    assert photograph.rgb[4, -5].argmax() == 1
+
+
+@pytest.mark.parametrize("data", [pages(), pages(1), png(corners()), webp(corners())])
+def test_of_one_picture_nothing_is_told(data: bytes) -> None:
+    assert read_photograph(data).warnings == ()

@@ -84,6 +84,14 @@ def test_the_same_frame_is_told_from_a_crop() -> None:
     assert not camera().is_same_frame(480, 640)
 
 
+def test_one_percent_is_the_most_unless_a_copy_is_so_small_that_it_is_rounded_by_more() -> None:
+    frame = Camera(645, 432, 2.0, 1.53)
+    assert frame.is_same_frame(645, 436)
+    assert not frame.is_same_frame(645, 437)
+    assert frame.is_same_frame(30, 20)
+    assert not frame.is_same_frame(30, 21)
+
+
 def test_refocusing_follows_the_lens() -> None:
     known = Camera(645, 432, 2.0, D200.k_cam_px(2.0, 645), focal_length_m=0.035)
     assert known.focused_at(1.0).k_cam_px == pytest.approx(D200.k_cam_px(1.0, 645))

@@ -79,7 +79,7 @@ def test_a_fault_is_shown_at_its_field(page: Page, expected_errors: list[str]) -
     fill(page, FRAME | LENS | {"Name": "no name", "f-number": "wide"})
     aperture = page.get_by_label("f-number")
     expect(aperture).to_have_attribute("aria-invalid", "true")
-    expect(aperture).to_have_accessible_description("Input should be a valid number")
+    expect(aperture).to_have_accessible_description("this must be a number")
     fill(page, {"f-number": "2,8"})
     expect(aperture).to_have_attribute("aria-invalid", "false")
     page.get_by_role("button", name="Create camera").click()
