@@ -181,9 +181,17 @@ export function sendJson(path, body, { method = "POST", headers = {}, ...options
 
 /** @param {any} camera @param {number | null} revision that it replaces; null for a new camera @returns {Promise<any>} the camera as it is stored */
 export function storeCamera(camera, revision) {
-	if (revision === null) return sendJson("cameras", camera);
+	if (revision === null) return sendJson("cameras", camera).catch(tellTaken);
 	const headers = { "If-Match": `"${revision}"` };
 	return sendJson(`cameras/${encodeURIComponent(camera.name)}`, camera, { method: "PUT", headers });
+}
+
+/** @param {unknown} error */
+function tellTaken(error) {
+	const problem = problemOf(error);
+	if (problem.status !== 409) throw problem;
+	const detail = "This name is taken: open that camera to change it.";
+	throw new Problem({ ...problem, detail, errors: [{ pointer: "#/name", detail }] });
 }
 
 /** @returns {Promise<any[]>} the cameras as they are now, by name */

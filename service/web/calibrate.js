@@ -2,7 +2,7 @@
 
 import { Problem, events, getJson, problemOf, storedKey, upload } from "./api.js";
 import { Ended, Running } from "./job_step.js";
-import { decimal, when } from "./numbers.js";
+import { toMetres, when } from "./numbers.js";
 import { Photographs, useLooks } from "./photo_step.js";
 import { ProblemBox } from "./problem_box.js";
 import { SHEET, SheetStep, isMeasured, patternOf } from "./sheet_step.js";
@@ -278,13 +278,6 @@ function useJob(job, attempt, setJob, setProblem, onEnd) {
 		follow();
 		return () => stop.abort();
 	}, [live, attempt]);
-}
-
-/** @param {string} text @returns {number | null | undefined} null for none, undefined for what is no distance */
-function toMetres(text) {
-	if (text.trim() === "") return null;
-	const value = decimal(text);
-	return Number.isFinite(value) && value > 0 ? value : undefined;
 }
 
 function newKey() {

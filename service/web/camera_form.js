@@ -2,7 +2,7 @@
 
 import { Problem, getJson, problemOf, sendJson, storeCamera } from "./api.js";
 import { CameraCurve } from "./camera_curve.js";
-import { BLANK, bodyOf, differences, fieldsOf, filledIn, missingOf } from "./camera_specs.js";
+import { BLANK, SENSOR_WIDTH, bodyOf, differences, fieldsOf, filledIn, missingOf } from "./camera_specs.js";
 import { PHOTOGRAPHS, mediaTypeOf } from "./photograph_files.js";
 import { ProblemBox } from "./problem_box.js";
 import { Table } from "./table.js";
@@ -47,7 +47,7 @@ export function CameraForm({ editing, onSaved, onCancel }) {
 		} catch (error) {
 			if (!(error instanceof Problem)) throw error;
 			if (error.status === 412) await showTheirs();
-			else setProblem(nameTaken(error));
+			else setProblem(error);
 		} finally {
 			setIsSaving(false);
 		}
@@ -140,7 +140,7 @@ export function CameraForm({ editing, onSaved, onCancel }) {
 						${field("lens/focal_length_mm", "Focal length (mm)", { hint: "the real one, never the 35-mm equivalent" })}
 						${field("lens/f_number", "f-number")}
 						${field("lens/pixel_pitch_um", "Pixel pitch (µm)", { hint: "of one sensor pixel" })}
-						${field("lens/sensor_width_px", "Sensor width (px)", { hint: "of the whole sensor, along the image width" })}
+						${field("lens/sensor_width_px", "Sensor width (px)", { hint: SENSOR_WIDTH })}
 					</div>`
 				: html`<div class="pair">
 						${field("k_cam_px", "k_cam (px)", { hint: "blur per unit of relative defocus, at the image width" })}
@@ -176,13 +176,13 @@ export function CameraForm({ editing, onSaved, onCancel }) {
 }
 
 /**
- * @param {{path: string, label: string, value: string, kind?: string, hint?: string, disabled?: boolean,
+ * @param {{path: string, label: string, value: string, form?: string, kind?: string, hint?: string, disabled?: boolean,
  *   faults: import("./api.js").FieldProblem[], onChange: (changed: Fields) => void}} props
  */
-function Field({ path, label, value, kind = "decimal", hint, disabled = false, faults, onChange }) {
+export function Field({ path, label, value, form = "camera", kind = "decimal", hint, disabled = false, faults, onChange }) {
 	const fault = faults.find(({ pointer }) => pointer === `#/${path}` || pointer.startsWith(`#/${path}/`))?.detail;
 	return html`<${TextField}
-		...${{ id: `camera-${path.replace("/", "-")}`, label, value, kind, fault, hint, disabled }}
+		...${{ id: `${form}-${path.replace("/", "-")}`, label, value, kind, fault, hint, disabled }}
 		onInput=${(/** @type {string} */ text) => onChange({ [path]: text })}
 	/>`;
 }
@@ -252,10 +252,4 @@ function usePreview(fields) {
 		};
 	}, [body]);
 	return seen;
-}
-
-/** @param {Problem} problem @returns {Problem} with the name marked, where it is taken */
-function nameTaken(problem) {
-	if (problem.status === 409) problem.errors = [{ pointer: "#/name", detail: "This name is taken." }];
-	return problem;
 }

@@ -7,13 +7,14 @@ import { Colours } from "./colour_controls.js";
 import { DraftForm } from "./draft_form.js";
 import { Exports } from "./exports.js";
 import { Legend } from "./legend.js";
-import { short } from "./numbers.js";
+import { short, toMetres } from "./numbers.js";
 import { PHOTOGRAPHS, mediaTypeOf, readShown } from "./photograph_files.js";
 import { ProblemBox } from "./problem_box.js";
 import { DepthReader } from "./reader.js";
 import { Distance, Readout, Timings, metres } from "./readout.js";
 import { Stage } from "./stage.js";
 import { Tape } from "./tape.js";
+import { TextField } from "./text_field.js";
 import { html, useCallback, useEffect, useMemo, useRef, useState } from "./vendor/preact.js";
 
 /** @typedef {import("./maps.js").Facts} Facts */
@@ -55,6 +56,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 	);
 	const [name, setName] = useState("");
 	const [side, setSide] = useState("auto");
+	const [focus, setFocus] = useState("");
 	const [focusM, setFocusM] = useState(/** @type {number | null} */ (null));
 	const [known, setKnown] = useState(/** @type {KnownDepth[]} */ ([]));
 	const [attempt, setAttempt] = useState(0);
@@ -76,8 +78,20 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 	const ask = { camera: name, side, focusM, known };
 
 	useEffect(() => {
-		if (brought !== null) setName(brought);
+		if (brought !== null && brought !== name) pick(brought);
 	}, [brought]);
+
+	function forgetFocus() {
+		setFocus("");
+		setFocusM(null);
+	}
+
+	/** @param {string} picked */
+	function pick(picked) {
+		setName(picked);
+		setIsDrafting(false);
+		forgetFocus();
+	}
 
 	const take = useCallback(async (/** @type {File | null | undefined} */ taken) => {
 		if (!taken) return;
@@ -85,6 +99,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 		setReading(null);
 		setMarks([]);
 		setKnown([]);
+		forgetFocus();
 		setPhotograph(null);
 		setIsOpening(true);
 		setIsDrafting(false);
@@ -198,10 +213,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 						<select
 							value=${camera ? name : ""}
 							aria-invalid=${isNotTheFrame}
-							onChange=${(/** @type {any} */ event) => {
-								setIsDrafting(false);
-								setName(event.target.value);
-							}}
+							onChange=${(/** @type {any} */ event) => pick(event.target.value)}
 						>
 							<option value="" disabled>${cameras === null ? "Loading…" : "Choose the camera that took it"}</option>
 							${(cameras ?? []).map((one) => html`<option key=${one.name} value=${one.name}>${one.name}</option>`)}
@@ -222,7 +234,12 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 					</select>
 				</label>
 				<div class="stack">
-					<${FocusField} camera=${camera} onFocusM=${setFocusM} />
+					<${TextField}
+						...${{ id: "depth-focus", label: "Focus distance of this shot, m", kind: "decimal", value: focus, onInput: setFocus }}
+						fault=${toMetres(focus) === undefined ? "This is no distance in metres." : ""}
+						hint=${camera ? `Left empty, the camera's: ${short(camera.focus_distance_m, 4)} m.` : ""}
+						onChange=${(/** @type {string} */ text) => toMetres(text) !== undefined && setFocusM(toMetres(text) ?? null)}
+					/>
 					<${Warnings} texts=${warned("focus")} />
 				</div>
 				<${FileButtons} hasFile=${file !== null} onFile=${take} />
@@ -245,9 +262,8 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 				mediaType=${mediaTypeOf(/** @type {File} */ (file))}
 				onStored=${async (/** @type {string} */ stored) => {
 					await reloadCameras();
-					setIsDrafting(false);
 					setProblem(null);
-					setName(stored);
+					pick(stored);
 				}}
 			/>`}
 			<${Progress} phase=${phase} onCancel=${cancel} />
@@ -361,28 +377,6 @@ function FileButtons({ hasFile, onFile }) {
 		<input ref=${chosen} type="file" accept=${PHOTOGRAPHS} hidden onChange=${onChange} />
 		<input ref=${taken} type="file" accept="image/*" capture="environment" hidden onChange=${onChange} />
 	</div>`;
-}
-
-/** @param {{camera: any, onFocusM: (focusM: number | null) => void}} props */
-function FocusField({ camera, onFocusM }) {
-	const [isWrong, setIsWrong] = useState(false);
-	return html`<label class="field"
-		>Focus distance of this shot, m
-		<input
-			type="number"
-			min="0.001"
-			step="any"
-			inputmode="decimal"
-			placeholder=${camera ? `${short(camera.focus_distance_m, 4)}, the camera's` : "the camera's"}
-			aria-invalid=${isWrong}
-			onChange=${(/** @type {any} */ event) => {
-				const { value, validity } = event.target;
-				setIsWrong(!validity.valid);
-				if (validity.valid) onFocusM(value === "" ? null : Number(value));
-			}}
-		/>
-		${isWrong && html`<span class="fault" role="alert">This is no distance in metres.</span>`}
-	</label>`;
 }
 
 /** @param {{picture: string, onPicture: (picture: string) => void}} props */

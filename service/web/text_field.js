@@ -4,9 +4,10 @@ import { html } from "./vendor/preact.js";
 
 /**
  * @param {{id: string, label: string, value: string, onInput: (value: string) => void, fault?: string, hint?: any,
- *   kind?: string, list?: string, disabled?: boolean, invalid?: boolean}} props
+ *   onChange?: (value: string) => void, kind?: string, list?: string, disabled?: boolean, invalid?: boolean}} props
+ *   `onChange` is for when the typing is over
  */
-export function TextField({ id, label, value, onInput, fault = "", hint, kind, list, disabled = false, invalid = fault !== "" }) {
+export function TextField({ id, label, value, onInput, fault = "", hint, onChange, kind, list, disabled = false, invalid = fault !== "" }) {
 	return html`
 		<div class="field">
 			<label for=${id}>${label}</label>
@@ -22,6 +23,7 @@ export function TextField({ id, label, value, onInput, fault = "", hint, kind, l
 				aria-invalid=${invalid}
 				aria-describedby=${`${id}-told`}
 				onInput=${(/** @type {any} */ event) => onInput(event.target.value)}
+				onChange=${(/** @type {any} */ event) => onChange?.(event.target.value)}
 			/>
 			<span id=${`${id}-told`} class=${fault ? "fault" : "hint"}>${fault || hint}</span>
 		</div>

@@ -98,7 +98,10 @@ def test_a_name_that_is_taken_is_told(
     page.get_by_label("k_cam", exact=True).check()
     fill(page, FRAME | {"Name": phone["name"], "k_cam (px)": "2"})
     page.get_by_role("button", name="Create camera").click()
-    expect(page.get_by_label("Name", exact=True)).to_have_accessible_description("This name is taken.")
+    expect(page.get_by_label("Name", exact=True)).to_have_accessible_description(
+        "This name is taken: open that camera to change it."
+    )
+    expect(page.get_by_role("alert")).not_to_contain_text(re.compile("PUT|#/"))
 
 
 @pytest.mark.parametrize("keeps_mine", [True, False])
@@ -227,6 +230,17 @@ def test_a_photograph_fills_the_form_in(page: Page) -> None:
     )
     expect(page.get_by_label("Image width (px)")).not_to_have_value("")
     expect(page.get_by_text("focus_distance_m is needed")).to_be_visible()
+
+
+def test_a_photograph_that_was_made_small_leaves_the_sensor_as_it_was_typed(page: Page) -> None:
+    page.goto("#cameras")
+    page.get_by_role("button", name="New camera").click()
+    fill(page, {"Sensor width (px)": "3872"})
+    page.get_by_label("Fill in from a photograph it took").set_input_files(
+        Path(__file__).parents[2] / "docs/pictures/coffee.jpg"
+    )
+    expect(page.get_by_label("Image width (px)")).to_have_value("645")
+    expect(page.get_by_label("Sensor width (px)")).to_have_value("3872")
 
 
 def test_a_photograph_takes_nothing_away_that_was_measured(page: Page, served: Server, phone: dict[str, Any]) -> None:

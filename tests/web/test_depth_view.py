@@ -15,7 +15,7 @@ import matplotlib
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from playwright.sync_api import Browser, Locator, Page, Position, expect
+from playwright.sync_api import Browser, Locator, Page, Position, Route, expect
 
 from model_export.served import Server, serving
 from tests.inference import photographs
@@ -285,10 +285,10 @@ def test_the_divider_uncovers_the_photograph(measured: Page) -> None:
 
 def test_another_side_or_focus_is_read_again(measured: Page, maps: Callable[..., Any]) -> None:
     side = measured.get_by_role("combobox", name="Side of the plane in focus")
-    focus = measured.get_by_role("spinbutton", name="Focus distance of this shot")
+    focus = measured.get_by_label("Focus distance of this shot")
 
     def refocus() -> None:
-        focus.fill("1.5")
+        focus.fill("1,5")
         focus.press("Enter")
 
     def change_side() -> None:
@@ -468,12 +468,61 @@ def test_a_photograph_that_is_no_frame_of_the_camera_drafts_its_own(
         ("Real focal length", "35"),
         ("f-number", "2.8"),
         ("Pixel pitch", "36"),
+        ("Sensor width", "320"),
     ):
         form.get_by_label(label).fill(value)
     form.get_by_role("button", name="Store the camera").click()
     stage(opened)
     assert served.ask("GET", "/cameras/squared").json()["lens"]["focal_length_mm"] == 35
     expect(opened.get_by_role("combobox", name="Camera", exact=True)).to_have_value("squared")
+
+
+def test_a_draft_asks_for_the_sensor_and_takes_commas(opened: Page, served: Server) -> None:
+    def forget_sensor(route: Route) -> None:
+        draft = route.fetch().json()
+        draft["lens"]["sensor_width_px"] = None
+        route.fulfill(json=draft)
+
+    opened.route("**/cameras/from-photo", forget_sensor)
+    give(opened)
+    form = opened.get_by_role("form", name="A camera from this photograph")
+    store = form.get_by_role("button", name="Store the camera")
+    fields = {"Name": "d200", "Focus distance": "2,0", "Real focal length": "35", "f-number": "2,8", "Pixel pitch": "6,05"}
+    for label, value in fields.items():
+        form.get_by_label(label).fill(value)
+    sensor = form.get_by_label("Sensor width (px)")
+    expect(sensor).to_have_value("")
+    expect(sensor).to_have_accessible_description("pixels across the full-size photograph the camera takes")
+    expect(form).to_contain_text("Fill in sensor width first.")
+    expect(store).to_be_disabled()
+    sensor.fill("wide")
+    expect(sensor).to_have_accessible_description("This is no number.")
+    expect(store).to_be_disabled()
+    sensor.fill("3872")
+    form.get_by_label("Name").fill("messenger")
+    store.click()
+    stage(opened)
+    lens = served.ask("GET", "/cameras/messenger").json()["lens"]
+    assert (lens["f_number"], lens["pixel_pitch_um"], lens["sensor_width_px"]) == (2.8, 6.05, 3872)
+
+
+def test_the_focus_of_one_shot_is_no_other_s(opened: Page, served: Server, d200: dict[str, Any]) -> None:
+    served.add({**d200, "name": "other"})
+    opened.reload()
+    focus = opened.get_by_label("Focus distance of this shot")
+    choose(opened)
+    focus.fill("far")
+    expect(focus).to_have_accessible_description("This is no distance in metres.")
+    give(opened)
+    for act in (lambda: choose(opened, "other"), lambda: give(opened)):
+        focus.fill("1,8")
+        with opened.expect_request(lambda request: "focus_distance_m=1.8" in request.url):
+            focus.press("Enter")
+        with opened.expect_request(lambda request: "/depth?" in request.url) as asked:
+            act()
+        assert "focus_distance_m" not in asked.value.url
+        expect(focus).to_have_value("")
+    served.ask("DELETE", "/cameras/other")
 
 
 def test_without_a_camera_the_photograph_is_asked_for_one(opened: Page, barriers: Callable[[Page], list[str]]) -> None:
