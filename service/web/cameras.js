@@ -258,9 +258,11 @@ function DeleteDialog({ camera, path, onClose, onDeleted, onStale }) {
 			<div class="stack">
 				<h2 id="delete-title">Delete ${camera.name}?</h2>
 				<p>Photographs can no longer be sent with this camera. Its name is free again, and its revisions are kept.</p>
-				<${ProblemBox} problem=${problem} onRetry=${[404, 412].includes(problem?.status ?? 0) ? onStale : undefined} />
+				<${ProblemBox} problem=${problem} />
 				<div class="row">
-					<button type="button" class="danger" onClick=${remove}>Delete ${camera.name}</button>
+					${[404, 412].includes(problem?.status ?? 0)
+						? html`<button type="button" class="primary" onClick=${onStale}>See how it is now</button>`
+						: html`<button type="button" class="danger" onClick=${remove}>Delete ${camera.name}</button>`}
 					<button type="button" onClick=${() => dialog.current?.close()}>Keep it</button>
 				</div>
 			</div>

@@ -35,7 +35,7 @@ import { html, useCallback, useEffect, useMemo, useRef, useState } from "./vendo
  */
 
 /** @typedef {{distanceM: number, sigmaM: number} | "unknown"} Measured */
-/** @typedef {{step: "upload", fraction: number | null} | {step: "work", since: number} | {step: "draw"}} Phase */
+/** @typedef {{step: "upload" | "receive", fraction: number | null} | {step: "work", since: number} | {step: "draw"}} Phase */
 
 const SIDES = [
 	["auto", "Let the model decide"],
@@ -157,6 +157,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 				signal,
 				onProgress: (fraction) =>
 					show(fraction === 1 ? { step: "work", since: performance.now() } : { step: "upload", fraction }),
+				onReceived: (fraction) => show({ step: "receive", fraction }),
 			});
 			show({ step: "draw" });
 			const facts = await reader.ask("load", { npz: answer.body });
@@ -184,7 +185,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 			if (signal.aborted) return;
 			setResult(null);
 			setPhase(null);
-			setProblem(error instanceof Problem ? error : unreadable(error));
+			setProblem(error instanceof Problem ? withSize(error) : unreadable(error));
 		}
 	}
 
@@ -247,14 +248,16 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 
 			<${ProblemBox}
 				problem=${problem}
-				onRetry=${problem && !isNotTheFrame && file && camera ? again : undefined}
-				onClose=${problem ? () => setProblem(null) : undefined}
+				onRetry=${file && camera ? again : undefined}
+				onClose=${() => setProblem(null)}
 			/>
 			${isNotTheFrame &&
 			!isDrafting &&
-			html`<div class="row">
-				<button type="button" onClick=${() => setIsDrafting(true)}>Draft a camera from this photograph</button>
-			</div>`}
+			html`<p>
+				If it is the whole frame of another camera,${" "}
+				<button type="button" class="depth-link" onClick=${() => setIsDrafting(true)}>draft a camera from this photograph</button>.
+				From a crop every depth would be wrong.
+			</p>`}
 			${wantsDraft &&
 			html`<${DraftForm}
 				key=${file}
@@ -420,8 +423,11 @@ function Progress({ phase, onCancel }) {
 		return () => clearInterval(timer);
 	}, [isWorking]);
 	if (phase === null) return null;
+	const fraction = "fraction" in phase ? phase.fraction : null;
+	const part = fraction ? ` ${Math.round(100 * fraction)} %` : "";
 	const says = {
-		upload: () => `Sending${phase.step === "upload" && phase.fraction ? ` ${Math.round(100 * phase.fraction)} %` : ""}`,
+		upload: () => `Sending${part}`,
+		receive: () => `Receiving the answer${part}`,
 		work: () =>
 			phase.step === "work" && `Waiting for a slot, reading the blur: ${((performance.now() - phase.since) / 1000).toFixed(1)} s`,
 		draw: () => "Drawing",
@@ -430,7 +436,7 @@ function Progress({ phase, onCancel }) {
 		<progress
 			key=${phase.step}
 			aria-label="Progress"
-			value=${phase.step === "upload" && phase.fraction !== null ? phase.fraction : undefined}
+			value=${fraction ?? undefined}
 		></progress>
 		<span class="number">${says()}</span>
 		<button type="button" onClick=${onCancel}>Cancel</button>
@@ -461,6 +467,16 @@ function about({ image_width_px, image_height_px, focus_distance_m, range_m, des
 /** @param {string} header `decode;dur=1.2, wait;dur=0.1` @returns {[string, number][]} */
 function readTimings(header) {
 	return Array.from(header.matchAll(/([\w-]+);dur=([\d.]+)/g), ([, stage, ms]) => [stage, Number(ms)]);
+}
+
+/** @param {Problem} problem @returns {Problem} with the size that would do, where the picture has too many pixels */
+function withSize(problem) {
+	const told = /(\d+)x(\d+) pixels, more than the (\d+) /.exec(problem.detail);
+	if (problem.status !== 413 || told === null) return problem;
+	const [width, height, most] = told.slice(1).map(Number);
+	const scale = Math.sqrt(most / (width * height));
+	const size = `${Math.floor(width * scale)}x${Math.floor(height * scale)}`;
+	return new Problem({ ...problem, detail: `${problem.detail} Make it ${size} or smaller: the camera need not change.` });
 }
 
 /** @param {unknown} error */

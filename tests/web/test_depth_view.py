@@ -3,6 +3,7 @@
 import base64
 import io
 import json
+import re
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -459,6 +460,7 @@ def test_a_photograph_that_is_no_frame_of_the_camera_drafts_its_own(
     give(opened, square)
     expect(opened.get_by_role("alert")).to_contain_text("320x320 pixels upright, the camera 645x432")
     expect(opened.get_by_role("combobox", name="Camera", exact=True)).to_have_attribute("aria-invalid", "true")
+    expect(opened.get_by_text("From a crop every depth would be wrong.")).to_be_visible()
     opened.get_by_role("button", name="Draft a camera").click()
     form = opened.get_by_role("form", name="A camera from this photograph")
     expect(form).to_contain_text("focus_distance_m is needed")
@@ -553,6 +555,50 @@ def test_a_full_service_says_when_and_a_cancelled_photograph_makes_room(
         second.get_by_role("button", name="Try again").click()
         stage(second)
         expect(second.get_by_role("alert")).to_have_count(0)
+
+
+def test_a_photograph_of_too_many_pixels_is_told_the_size_that_would_do(
+    browser: Browser, tmp_path: Path, tiny_model_dir: Path, d200: dict[str, Any]
+) -> None:
+    few = {"CAMIND_MAX_IMAGE_PIXELS": "100000"}
+    with (
+        serving(tmp_path / "data", "--model", tiny_model_dir, settings=few) as server,
+        watched(browser, server.url, [REFUSED]) as page,
+    ):
+        server.add(d200)
+        page.goto("")
+        choose(page)
+        give(page)
+        problem = page.get_by_role("alert")
+        expect(problem).to_contain_text("Make it 386x258 or smaller: the camera need not change.")
+        expect(problem.get_by_role("button", name="Dismiss")).to_be_visible()
+        expect(problem.get_by_role("button", name="Try again")).to_have_count(0)
+        pixels = cv2.imread(str(PHOTOGRAPH))
+        assert pixels is not None
+        give(page, cv2.imencode(".jpg", cv2.resize(pixels, (386, 258)))[1].tobytes())
+        stage(page)
+
+
+def test_one_tries_again_where_that_may_help(opened: Page) -> None:
+    helps = opened.evaluate(
+        """async (statuses) => {
+          const { Problem } = await import("./web/api.js");
+          return statuses.filter((status) => new Problem({ status, title: "", detail: "" }).isPassing);
+        }""",
+        [0, 400, 404, 408, 409, 413, 415, 422, 429, 500, 503],
+    )
+    assert helps == [0, 408, 429, 500, 503]
+
+
+def test_an_answer_that_comes_slowly_is_said_to_come(opened: Page) -> None:
+    network = opened.context.new_cdp_session(opened)
+    slow = {"offline": False, "latency": 0, "uploadThroughput": -1, "downloadThroughput": 2_000_000}
+    network.send("Network.emulateNetworkConditions", slow)
+    choose(opened)
+    give(opened)
+    expect(opened.get_by_text(re.compile(r"^Receiving the answer \d+ %$"))).to_be_visible()
+    expect(opened.get_by_role("progressbar", name="Progress")).to_have_attribute("value", re.compile(r"0\.\d"))
+    stage(opened)
 
 
 def test_a_photograph_that_browsers_do_not_show_is_read_all_the_same(opened: Page) -> None:
