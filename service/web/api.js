@@ -241,11 +241,7 @@ async function asText(body) {
 	return typeof body === "string" ? body : JSON.stringify(body);
 }
 
-/**
- * @param {string} path
- * @param {UploadOptions} options
- * @returns {Promise<{status: number, headers: Headers, body: any}>}
- */
+/** @type {(path: string, options: UploadOptions) => Promise<{status: number, headers: Headers, body: any}>} */
 function sendWithProgress(path, { method = "POST", headers = {}, body = null, signal, onProgress, onReceived, responseType = "" }) {
 	return new Promise((resolve, reject) => {
 		const sent = new XMLHttpRequest();

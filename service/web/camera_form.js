@@ -4,7 +4,7 @@ import { Problem, getJson, problemOf, sendJson, storeCamera } from "./api.js";
 import { CameraCurve } from "./camera_curve.js";
 import { BLANK, SENSOR_WIDTH, bodyOf, differences, fieldsOf, filledIn, missingOf } from "./camera_specs.js";
 import { PHOTOGRAPHS, mediaTypeOf } from "./photograph_files.js";
-import { ProblemBox } from "./problem_box.js";
+import { ProblemBox, Warnings, useProblem } from "./problem_box.js";
 import { Table } from "./table.js";
 import { TextField } from "./text_field.js";
 import { html, useEffect, useRef, useState } from "./vendor/preact.js";
@@ -13,14 +13,21 @@ const WAIT_MS = 250;
 
 /** @typedef {import("./camera_specs.js").Fields} Fields */
 
+/** Bring the reader to a heading, which may be out of sight. @param {HTMLElement | null} heading */
+export function arriveAt(heading) {
+	heading?.focus({ preventScroll: true });
+	const top = heading?.getBoundingClientRect().top ?? 0;
+	if (top < 0 || top > innerHeight / 2) heading?.scrollIntoView();
+}
+
 /**
- * @param {{editing: any | null, onSaved: (camera: any, words: string) => void, onCancel: () => void}} props
+ * @param {{editing: any | null, onSaved: (camera: any, words: string) => void, onTyped: () => void, onCancel: () => void}} props
  *   `editing` is the camera as it was read, null for a new one
  */
-export function CameraForm({ editing, onSaved, onCancel }) {
+export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 	const [base, setBase] = useState(editing);
 	const [fields, setFields] = useState(/** @type {Fields} */ (editing ? fieldsOf(editing) : BLANK));
-	const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
+	const [problem, setProblem] = useProblem();
 	const [told, setTold] = useState(/** @type {string[]} */ ([]));
 	const [theirs, setTheirs] = useState(/** @type {any | null} */ (null));
 	const [isSaving, setIsSaving] = useState(false);
@@ -29,12 +36,13 @@ export function CameraForm({ editing, onSaved, onCancel }) {
 	const faults = [...previewFaults, ...(problem?.errors ?? [])];
 	const missing = missingOf(fields);
 
-	useEffect(() => title.current?.focus(), []);
+	useEffect(() => arriveAt(title.current), []);
 
 	/** @param {Fields} changed */
 	function change(changed) {
 		setFields((before) => ({ ...before, ...changed }));
 		setProblem(null);
+		onTyped();
 	}
 
 	/** @param {number | null} revision that is replaced; null for a new camera */
@@ -71,6 +79,7 @@ export function CameraForm({ editing, onSaved, onCancel }) {
 			const draft = await getJson("cameras/from-photo", { method: "POST", headers, body: file });
 			setTold(draft.warnings);
 			setFields((before) => filledIn(before, draft));
+			onTyped();
 			setProblem(null);
 		} catch (error) {
 			setProblem(problemOf(error));
@@ -116,7 +125,7 @@ export function CameraForm({ editing, onSaved, onCancel }) {
 				<input type="file" accept=${PHOTOGRAPHS} onChange=${fillFromPhotograph} />
 				<span class="hint">Its EXIF tells lens and sensor. The photograph is not kept.</span>
 			</label>
-			${told.length > 0 && html`<ul class="notice plain" role="status">${told.map((words) => html`<li>${words}</li>`)}</ul>`}
+			${told.length > 0 && html`<div role="status"><${Warnings} texts=${told} /></div>`}
 			<div class="pair">
 				${field("name", "Name", { disabled: base !== null, kind: "text", hint: "letters, digits, dots, dashes" })}
 				${field("focus_distance_m", "Focus distance (m)", { hint: "from the lens to what is sharp" })}

@@ -22,6 +22,16 @@ const NEEDED_OF_LENS = {
 /** What is asked for as a sensor's width. */
 export const SENSOR_WIDTH = "pixels across the full-size photograph the camera takes";
 
+/** Times the focus distance: what is nearer or farther has no answer (the model's `depth_ratio`). */
+const ANSWERED = [0.15, 8];
+
+/** @param {any} camera as the API reads or previews it @returns {[number, number] | null} where its depths are good, in metres */
+export function usableM({ range_m, focus_distance_m }) {
+	const near = Math.max(range_m.near, ANSWERED[0] * focus_distance_m);
+	const far = Math.min(range_m.far, ANSWERED[1] * focus_distance_m);
+	return near < far ? [near, far] : null;
+}
+
 /** The fields of a camera that is not there yet. @type {Fields} */
 export const BLANK = { "by": "lens", "gamma_px": "0.5", "lens/k_r": "4" };
 

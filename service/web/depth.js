@@ -1,6 +1,7 @@
 /** The depth view: a camera, a photograph, and the metres in it. */
 
 import { Problem, upload } from "./api.js";
+import { usableM } from "./camera_specs.js";
 import { CloudView } from "./cloud_view.js";
 import { depthPath } from "./commands.js";
 import { Colours } from "./colour_controls.js";
@@ -9,12 +10,12 @@ import { Exports } from "./exports.js";
 import { Legend } from "./legend.js";
 import { short, toMetres } from "./numbers.js";
 import { PHOTOGRAPHS, mediaTypeOf, readShown } from "./photograph_files.js";
-import { ProblemBox } from "./problem_box.js";
+import { ProblemBox, Warnings, useProblem } from "./problem_box.js";
 import { DepthReader } from "./reader.js";
 import { Distance, Readout, Timings, metres } from "./readout.js";
 import { Stage } from "./stage.js";
 import { Tape } from "./tape.js";
-import { TextField } from "./text_field.js";
+import { Choice, TextField } from "./text_field.js";
 import { html, useCallback, useEffect, useMemo, useRef, useState } from "./vendor/preact.js";
 
 /** @typedef {import("./maps.js").Facts} Facts */
@@ -62,7 +63,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 	const [attempt, setAttempt] = useState(0);
 	const [isDrafting, setIsDrafting] = useState(false);
 	const [phase, setPhase] = useState(/** @type {Phase | null} */ (null));
-	const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
+	const [problem, setProblem] = useProblem();
 	const [result, setResult] = useState(/** @type {Result | null} */ (null));
 	const [look, setLook] = useState(FIRST_LOOK);
 	const [isOpening, setIsOpening] = useState(false);
@@ -78,19 +79,15 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 	const ask = { camera: name, side, focusM, known };
 
 	useEffect(() => {
-		if (brought !== null && brought !== name) pick(brought);
+		if (brought === null || brought === name) return;
+		setName(brought);
+		setIsDrafting(false);
+		forgetFocus();
 	}, [brought]);
 
 	function forgetFocus() {
 		setFocus("");
 		setFocusM(null);
-	}
-
-	/** @param {string} picked */
-	function pick(picked) {
-		setName(picked);
-		setIsDrafting(false);
-		forgetFocus();
 	}
 
 	const take = useCallback(async (/** @type {File | null | undefined} */ taken) => {
@@ -214,7 +211,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 						<select
 							value=${camera ? name : ""}
 							aria-invalid=${isNotTheFrame}
-							onChange=${(/** @type {any} */ event) => pick(event.target.value)}
+							onChange=${(/** @type {any} */ event) => go("depth", { camera: event.target.value, replaces: true })}
 						>
 							<option value="" disabled>${cameras === null ? "Loading…" : "Choose the camera that took it"}</option>
 							${(cameras ?? []).map((one) => html`<option key=${one.name} value=${one.name}>${one.name}</option>`)}
@@ -228,12 +225,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 					</p>`}
 					<${Warnings} texts=${warned("camera")} />
 				</div>
-				<label class="field"
-					>Side of the plane in focus
-					<select value=${side} onChange=${(/** @type {any} */ event) => setSide(event.target.value)}>
-						${SIDES.map(([value, says]) => html`<option key=${value} value=${value}>${says}</option>`)}
-					</select>
-				</label>
+				<${Choice} label="Side of the plane in focus" value=${side} options=${SIDES} onChange=${setSide} />
 				<div class="stack">
 					<${TextField}
 						...${{ id: "depth-focus", label: "Focus distance of this shot, m", kind: "decimal", value: focus, onInput: setFocus }}
@@ -266,7 +258,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 				onStored=${async (/** @type {string} */ stored) => {
 					await reloadCameras();
 					setProblem(null);
-					pick(stored);
+					go("depth", { camera: stored, replaces: true });
 				}}
 			/>`}
 			<${Progress} phase=${phase} onCancel=${cancel} />
@@ -327,20 +319,15 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 function useFilesFromOutside(shown, take) {
 	useEffect(() => {
 		if (!shown) return undefined;
-		const drop = (/** @type {DragEvent} */ event) => {
-			if (!event.dataTransfer?.files.length) return;
-			event.preventDefault();
-			take(event.dataTransfer.files[0]);
-		};
-		const paste = (/** @type {ClipboardEvent} */ event) => {
-			take(Array.from(event.clipboardData?.files ?? []).find((file) => file.type.startsWith("image/")));
-		};
-		document.addEventListener("drop", drop);
-		document.addEventListener("paste", paste);
-		return () => {
-			document.removeEventListener("drop", drop);
-			document.removeEventListener("paste", paste);
-		};
+		const end = new AbortController();
+		const { signal } = end;
+		document.addEventListener("drop", ({ dataTransfer }) => take(dataTransfer?.files[0]), { signal });
+		document.addEventListener(
+			"paste",
+			({ clipboardData }) => take(Array.from(clipboardData?.files ?? []).find(({ type }) => type.startsWith("image/"))),
+			{ signal },
+		);
+		return () => end.abort();
 	}, [shown]);
 }
 
@@ -443,14 +430,6 @@ function Progress({ phase, onCancel }) {
 	</div>`;
 }
 
-/** @param {{texts: string[]}} props */
-function Warnings({ texts }) {
-	if (texts.length === 0) return null;
-	return html`<ul class="notice depth-warnings">
-		${texts.map((text) => html`<li key=${text}>${text.replace(/^[a-z](?!\w*_)/, (one) => one.toUpperCase())}</li>`)}
-	</ul>`;
-}
-
 /** @param {string} text @returns {"camera" | "focus" | "result"} beside what it should be read */
 function placeOfWarning(text) {
 	if (text.includes("focal length")) return "focus";
@@ -458,9 +437,11 @@ function placeOfWarning(text) {
 }
 
 /** @param {any} camera */
-function about({ image_width_px, image_height_px, focus_distance_m, range_m, description }) {
-	const range = `reads up to ${short(range_m.far, 2)} m well`;
-	const numbers = `${image_width_px} × ${image_height_px} px, focused at ${short(focus_distance_m, 4)} m, ${range}`;
+function about(camera) {
+	const { image_width_px, image_height_px, focus_distance_m, description } = camera;
+	const range = usableM(camera);
+	const reads = range ? `reads ${short(range[0], 2)} to ${short(range[1], 2)} m well` : "reads no depth well";
+	const numbers = `${image_width_px} × ${image_height_px} px, focused at ${short(focus_distance_m, 4)} m, ${reads}`;
 	return description ? `${description}. ${numbers}` : numbers;
 }
 

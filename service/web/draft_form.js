@@ -1,10 +1,10 @@
 /** A camera drafted by the service from a photograph's EXIF, to be completed and stored. */
 
-import { Problem, storeCamera, upload } from "./api.js";
+import { problemOf, storeCamera, upload } from "./api.js";
 import { Field } from "./camera_form.js";
 import { SENSOR_WIDTH, bodyOf, fieldsOf, missingOf } from "./camera_specs.js";
 import { decimal } from "./numbers.js";
-import { ProblemBox } from "./problem_box.js";
+import { ProblemBox, Warnings, useProblem } from "./problem_box.js";
 import { html, useEffect, useState } from "./vendor/preact.js";
 
 const NUMBERS = [
@@ -19,7 +19,7 @@ const NUMBERS = [
 export function DraftForm({ file, mediaType, onStored }) {
 	const [draft, setDraft] = useState(/** @type {any} */ (null));
 	const [fields, setFields] = useState(/** @type {import("./camera_specs.js").Fields} */ ({}));
-	const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
+	const [problem, setProblem] = useProblem();
 	const [isStoring, setIsStoring] = useState(false);
 
 	useEffect(() => {
@@ -30,15 +30,9 @@ export function DraftForm({ file, mediaType, onStored }) {
 				setDraft(body);
 				setFields(fieldsOf(body));
 			})
-			.catch(show);
+			.catch((error) => abort.signal.aborted || setProblem(problemOf(error)));
 		return () => abort.abort();
 	}, [file]);
-
-	/** @param {unknown} error */
-	function show(error) {
-		if (error instanceof Problem) setProblem(error);
-		else if (!(error instanceof DOMException)) throw error;
-	}
 
 	/** @param {SubmitEvent} event */
 	async function store(event) {
@@ -48,7 +42,7 @@ export function DraftForm({ file, mediaType, onStored }) {
 		try {
 			await onStored((await storeCamera(bodyOf(fields), null)).name);
 		} catch (error) {
-			show(error);
+			setProblem(problemOf(error));
 		} finally {
 			setIsStoring(false);
 		}
@@ -80,10 +74,7 @@ export function DraftForm({ file, mediaType, onStored }) {
 		<div class="depth-draft">
 			${field("name", "Name", "", "text")} ${NUMBERS.map(([path, label, hint]) => field(path, label, hint))}
 		</div>
-		${draft.warnings.length > 0 &&
-		html`<ul class="notice depth-warnings">
-			${draft.warnings.map((/** @type {string} */ text) => html`<li key=${text}>${text}</li>`)}
-		</ul>`}
+		<${Warnings} texts=${draft.warnings} />
 		<${ProblemBox} problem=${problem} />
 		<div class="row">
 			<button type="submit" class="primary" disabled=${isStoring || missing.length + faults.length > 0}>

@@ -1,4 +1,4 @@
-/** What went wrong and what to do about it. */
+/** What went wrong and what to do about it, and what may go wrong. */
 
 import { html, useEffect, useState } from "./vendor/preact.js";
 
@@ -29,6 +29,16 @@ export function ProblemBox({ problem, onRetry, onClose }) {
 		</div>
 	`;
 }
+
+/** @param {{texts: string[]}} props */
+export function Warnings({ texts }) {
+	if (texts.length === 0) return null;
+	return html`<ul class="notice warnings">
+		${texts.map((text) => html`<li key=${text}>${text.replace(/^[a-z](?!\w*_)/, (one) => one.toUpperCase())}</li>`)}
+	</ul>`;
+}
+
+export const useProblem = () => useState(/** @type {import("./api.js").Problem | null} */ (null));
 
 /** @param {import("./api.js").Problem | null} problem whose wait is counted down, in seconds */
 function useCountdown(problem) {

@@ -1,4 +1,4 @@
-/** A line of text with its label, and under it what it is for or what is wrong with it. */
+/** Fields with their labels: a line of text, and under it what it is for or what is wrong with it; a choice. */
 
 import { html } from "./vendor/preact.js";
 
@@ -28,4 +28,14 @@ export function TextField({ id, label, value, onInput, fault = "", hint, onChang
 			<span id=${`${id}-told`} class=${fault ? "fault" : "hint"}>${fault || hint}</span>
 		</div>
 	`;
+}
+
+/** @param {{label: string, value: string, options: string[][], onChange: (value: string) => void}} props `options` are values and words */
+export function Choice({ label, value, options, onChange }) {
+	return html`<label class="field">
+		${label}
+		<select value=${value} onChange=${(/** @type {any} */ event) => onChange(event.target.value)}>
+			${options.map(([one, words]) => html`<option key=${one} value=${one}>${words}</option>`)}
+		</select>
+	</label>`;
 }

@@ -259,6 +259,10 @@ def test_colours_are_those_of_the_metres(measured: Page, maps: Callable[..., Any
 
     eventually(measured, is_painted)
     expect(measured.locator(".depth-ticks")).to_contain_text("2")
+    far = measured.get_by_label("Far end of the colours, metres")
+    far.fill("3,25")
+    far.press("Enter")
+    expect(far).to_have_value("3.250")
 
 
 def test_colour_maps_are_those_that_others_draw(opened: Page) -> None:
@@ -489,7 +493,13 @@ def test_a_draft_asks_for_the_sensor_and_takes_commas(opened: Page, served: Serv
     give(opened)
     form = opened.get_by_role("form", name="A camera from this photograph")
     store = form.get_by_role("button", name="Store the camera")
-    fields = {"Name": "d200", "Focus distance": "2,0", "Real focal length": "35", "f-number": "2,8", "Pixel pitch": "6,05"}
+    fields = {
+        "Name": "d200",
+        "Focus distance": "2,0",
+        "Real focal length": "35",
+        "f-number": "2,8",
+        "Pixel pitch": "6,05",
+    }
     for label, value in fields.items():
         form.get_by_label(label).fill(value)
     sensor = form.get_by_label("Sensor width (px)")
@@ -525,6 +535,17 @@ def test_the_focus_of_one_shot_is_no_other_s(opened: Page, served: Server, d200:
         assert "focus_distance_m" not in asked.value.url
         expect(focus).to_have_value("")
     served.ask("DELETE", "/cameras/other")
+
+
+def test_the_camera_stays_in_the_address(opened: Page) -> None:
+    choose(opened)
+    assert opened.url.endswith("#depth/d200")
+    opened.reload()
+    expect(opened.get_by_role("combobox", name="Camera", exact=True)).to_have_value("d200")
+    opened.get_by_role("tab", name="Status").click()
+    opened.go_back()
+    assert opened.url.endswith("#depth/d200")
+    expect(opened.get_by_role("combobox", name="Camera", exact=True)).to_have_value("d200")
 
 
 def test_without_a_camera_the_photograph_is_asked_for_one(opened: Page, barriers: Callable[[Page], list[str]]) -> None:
