@@ -34,6 +34,11 @@ export class Problem extends Error {
 		this.requestId = requestId;
 		this.retryAfterS = retryAfterS;
 	}
+
+	/** Whether the same request may fare better later, or with a key. */
+	get isPassing() {
+		return [0, 401, 408, 429].includes(this.status) || this.status >= 500;
+	}
 }
 
 /** @param {unknown} error @returns {Problem} the error, if it is one; else it is thrown on */
@@ -181,9 +186,17 @@ export function sendJson(path, body, { method = "POST", headers = {}, ...options
 
 /** @param {any} camera @param {number | null} revision that it replaces; null for a new camera @returns {Promise<any>} the camera as it is stored */
 export function storeCamera(camera, revision) {
-	if (revision === null) return sendJson("cameras", camera);
+	if (revision === null) return sendJson("cameras", camera).catch(tellTaken);
 	const headers = { "If-Match": `"${revision}"` };
 	return sendJson(`cameras/${encodeURIComponent(camera.name)}`, camera, { method: "PUT", headers });
+}
+
+/** @param {unknown} error */
+function tellTaken(error) {
+	const problem = problemOf(error);
+	if (problem.status !== 409) throw problem;
+	const detail = "This name is taken: open that camera to change it.";
+	throw new Problem({ ...problem, detail, errors: [{ pointer: "#/name", detail }] });
 }
 
 /** @returns {Promise<any[]>} the cameras as they are now, by name */
@@ -200,11 +213,17 @@ export async function everyCamera() {
 }
 
 /**
+ * `onProgress` gets the part sent, 0 to 1, or null where it is unknown; `onReceived` that of the answer.
+ *
+ * @typedef {RequestOptions & {onProgress?: (fraction: number | null) => void, onReceived?: (fraction: number | null) => void,
+ *   responseType?: XMLHttpRequestResponseType}} UploadOptions
+ */
+
+/**
  * Send a body with progress.
  *
  * @param {string} path
- * @param {RequestOptions & {onProgress?: (fraction: number | null) => void, responseType?: XMLHttpRequestResponseType}} [options]
- *   `onProgress` gets the part sent, 0 to 1, or null where it is unknown
+ * @param {UploadOptions} [options]
  * @returns {Promise<{status: number, headers: Headers, body: any}>}
  */
 export async function upload(path, options = {}) {
@@ -222,22 +241,18 @@ async function asText(body) {
 	return typeof body === "string" ? body : JSON.stringify(body);
 }
 
-/**
- * @param {string} path
- * @param {RequestOptions & {onProgress?: (fraction: number | null) => void, responseType?: XMLHttpRequestResponseType}} options
- * @returns {Promise<{status: number, headers: Headers, body: any}>}
- */
-function sendWithProgress(path, { method = "POST", headers = {}, body = null, signal, onProgress, responseType = "" }) {
+/** @type {(path: string, options: UploadOptions) => Promise<{status: number, headers: Headers, body: any}>} */
+function sendWithProgress(path, { method = "POST", headers = {}, body = null, signal, onProgress, onReceived, responseType = "" }) {
 	return new Promise((resolve, reject) => {
 		const sent = new XMLHttpRequest();
 		const abort = () => sent.abort();
 		sent.open(method, path);
 		sent.responseType = responseType;
 		for (const [name, value] of Object.entries(headers)) sent.setRequestHeader(name, value);
-		if (onProgress) {
-			sent.upload.onprogress = ({ lengthComputable, loaded, total }) =>
-				onProgress(lengthComputable && total > 0 ? loaded / total : null);
-		}
+		const part = (/** @type {ProgressEvent} */ { lengthComputable, loaded, total }) =>
+			lengthComputable && total > 0 ? loaded / total : null;
+		if (onProgress) sent.upload.onprogress = (event) => onProgress(part(event));
+		if (onReceived) sent.onprogress = (event) => onReceived(part(event));
 		sent.onload = () => {
 			const lines = sent.getAllResponseHeaders().trim().split("\r\n");
 			const pairs = lines.map((line) => /** @type {[string, string]} */ (line.split(/:\s*(.*)/s).slice(0, 2)));

@@ -1,13 +1,13 @@
 /** The page's frame: tabs by location hash, the cameras that all of them use, the API key, and what is said aloud. */
 
-import { KEY_CHANGED, Problem, everyCamera, forgetKey, problemOf, storedKey } from "./api.js";
+import { KEY_CHANGED, everyCamera, forgetKey, problemOf, storedKey } from "./api.js";
 import { CalibrateView } from "./calibrate.js";
 import { CamerasView } from "./cameras.js";
 import { DepthView } from "./depth.js";
 import { KeyDialog } from "./key_dialog.js";
-import { ProblemBox } from "./problem_box.js";
+import { ProblemBox, useProblem } from "./problem_box.js";
 import { StatusView } from "./status.js";
-import { html, render, useCallback, useEffect, useState } from "./vendor/preact.js";
+import { html, render, useCallback, useEffect, useRef, useState } from "./vendor/preact.js";
 
 /** @typedef {"depth" | "cameras" | "calibrate" | "status"} Tab */
 
@@ -17,9 +17,10 @@ import { html, render, useCallback, useEffect, useState } from "./vendor/preact.
  * @typedef {object} ViewProps
  * @property {boolean} shown whether the view's tab is in front
  * @property {any[] | null} cameras as the API gives them, by name; null while they load
- * @property {string | null} camera the name that `go` brought along, for the view in front
+ * @property {string | null} camera the name in the address, for the view in front
  * @property {() => Promise<void>} reloadCameras
- * @property {(tab: Tab, about?: {camera?: string}) => void} go change the tab, and pick the camera there
+ * @property {(tab: Tab, about?: {camera?: string | null, replaces?: boolean}) => void} go change the tab, and pick the camera
+ *   there; the way back leads past an address that is replaced
  * @property {(text: string) => void} announce say it to who cannot see it
  */
 
@@ -42,9 +43,17 @@ function readHash() {
 	}
 }
 
+/** @param {Tab} tab @param {string | null} [camera] */
+const hashOf = (tab, camera) => (camera ? `#${tab}/${encodeURIComponent(camera)}` : `#${tab}`);
+
 /** @type {ViewProps["go"]} */
-function go(tab, { camera } = {}) {
-	location.hash = camera ? `${tab}/${encodeURIComponent(camera)}` : tab;
+function go(tab, { camera, replaces = false } = {}) {
+	const hash = hashOf(tab, camera);
+	if (!replaces) location.hash = hash;
+	else if (hash !== location.hash) {
+		history.replaceState(null, "", hash);
+		dispatchEvent(new Event("hashchange"));
+	}
 }
 
 function useHash() {
@@ -53,8 +62,8 @@ function useHash() {
 		const read = () => {
 			const found = readHash();
 			setPlace(found);
-			// it is brought once: on the way back it would take the place of what was chosen or typed since
-			if (found.camera) history.replaceState(null, "", `#${found.tab}`);
+			// it is brought once: on the way back it would take the place of what was typed since
+			if (found.tab === "calibrate") history.replaceState(null, "", "#calibrate");
 		};
 		read();
 		addEventListener("hashchange", read);
@@ -65,8 +74,11 @@ function useHash() {
 
 function App() {
 	const place = useHash();
+	/** The camera in each tab's address when it was left. */
+	const left = useRef(/** @type {Partial<Record<Tab, string | null>>} */ ({})).current;
+	if (place.tab !== "calibrate") left[place.tab] = place.camera;
 	const [cameras, setCameras] = useState(/** @type {any[] | null} */ (null));
-	const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
+	const [problem, setProblem] = useProblem();
 	const [said, setSaid] = useState("");
 	const [hasKey, setHasKey] = useState(storedKey() !== null);
 
@@ -86,16 +98,6 @@ function App() {
 		reloadCameras();
 	}, []);
 	useEffect(() => {
-		// what misses its place must not be opened instead of the page, which would be lost
-		const keep = (/** @type {DragEvent} */ event) => {
-			if (event.dataTransfer?.types.includes("Files")) event.preventDefault();
-		};
-		for (const kind of /** @type {const} */ (["dragover", "drop"])) document.addEventListener(kind, keep);
-		return () => {
-			for (const kind of /** @type {const} */ (["dragover", "drop"])) document.removeEventListener(kind, keep);
-		};
-	}, []);
-	useEffect(() => {
 		function onKeyChanged() {
 			setHasKey(storedKey() !== null);
 			if (problem !== null && storedKey() !== null) reloadCameras();
@@ -111,7 +113,7 @@ function App() {
 		if (to === undefined || event.altKey || event.ctrlKey || event.metaKey) return;
 		event.preventDefault();
 		const { tab } = TABS[(to + TABS.length) % TABS.length];
-		go(tab);
+		go(tab, { camera: left[tab] });
 		document.getElementById(`tab-${tab}`)?.focus();
 	}
 
@@ -124,7 +126,7 @@ function App() {
 						key=${tab}
 						id=${`tab-${tab}`}
 						role="tab"
-						href=${`#${tab}`}
+						href=${hashOf(tab, left[tab])}
 						aria-selected=${tab === place.tab}
 						aria-controls=${`panel-${tab}`}
 						tabindex=${tab === place.tab ? 0 : -1}
@@ -167,4 +169,8 @@ function App() {
 	`;
 }
 
+// what misses its place must not be opened instead of the page, which would be lost
+for (const kind of /** @type {const} */ (["dragover", "drop"])) {
+	document.addEventListener(kind, (event) => event.dataTransfer?.types.includes("Files") && event.preventDefault());
+}
 render(html`<${App} />`, document.body);

@@ -2,9 +2,9 @@
 
 import { Problem, events, getJson, problemOf, storedKey, upload } from "./api.js";
 import { Ended, Running } from "./job_step.js";
-import { decimal, when } from "./numbers.js";
+import { toMetres, when } from "./numbers.js";
 import { Photographs, useLooks } from "./photo_step.js";
-import { ProblemBox } from "./problem_box.js";
+import { ProblemBox, useProblem } from "./problem_box.js";
 import { SHEET, SheetStep, isMeasured, patternOf } from "./sheet_step.js";
 import { Table } from "./table.js";
 import { TextField } from "./text_field.js";
@@ -28,7 +28,7 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
 	const [focus, setFocus] = useState("");
 	const [job, setJob] = useState(/** @type {any | null} */ (null));
 	const [recent, setRecent] = useState(/** @type {any[]} */ ([]));
-	const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
+	const [problem, setProblem] = useProblem();
 	const [attempt, setAttempt] = useState(0);
 	const [sent, setSent] = useState(/** @type {number | null | undefined} */ (undefined));
 	const title = useRef(/** @type {HTMLHeadingElement | null} */ (null));
@@ -161,7 +161,6 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
 					photos=${photos}
 					query=${query}
 					focus=${focusM ?? null}
-					onAdd=${(/** @type {Photo[]} */ added) => setPhotos((before) => [...before, ...added])}
 					onChange=${setPhotos}
 					announce=${announce}
 				/>
@@ -278,13 +277,6 @@ function useJob(job, attempt, setJob, setProblem, onEnd) {
 		follow();
 		return () => stop.abort();
 	}, [live, attempt]);
-}
-
-/** @param {string} text @returns {number | null | undefined} null for none, undefined for what is no distance */
-function toMetres(text) {
-	if (text.trim() === "") return null;
-	const value = decimal(text);
-	return Number.isFinite(value) && value > 0 ? value : undefined;
 }
 
 function newKey() {

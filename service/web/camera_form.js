@@ -2,9 +2,9 @@
 
 import { Problem, getJson, problemOf, sendJson, storeCamera } from "./api.js";
 import { CameraCurve } from "./camera_curve.js";
-import { BLANK, bodyOf, differences, fieldsOf, filledIn, missingOf } from "./camera_specs.js";
+import { BLANK, SENSOR_WIDTH, bodyOf, differences, fieldsOf, filledIn, missingOf } from "./camera_specs.js";
 import { PHOTOGRAPHS, mediaTypeOf } from "./photograph_files.js";
-import { ProblemBox } from "./problem_box.js";
+import { ProblemBox, Warnings, useProblem } from "./problem_box.js";
 import { Table } from "./table.js";
 import { TextField } from "./text_field.js";
 import { html, useEffect, useRef, useState } from "./vendor/preact.js";
@@ -13,14 +13,21 @@ const WAIT_MS = 250;
 
 /** @typedef {import("./camera_specs.js").Fields} Fields */
 
+/** Bring the reader to a heading, which may be out of sight. @param {HTMLElement | null} heading */
+export function arriveAt(heading) {
+	heading?.focus({ preventScroll: true });
+	const top = heading?.getBoundingClientRect().top ?? 0;
+	if (top < 0 || top > innerHeight / 2) heading?.scrollIntoView();
+}
+
 /**
- * @param {{editing: any | null, onSaved: (camera: any, words: string) => void, onCancel: () => void}} props
+ * @param {{editing: any | null, onSaved: (camera: any, words: string) => void, onTyped: () => void, onCancel: () => void}} props
  *   `editing` is the camera as it was read, null for a new one
  */
-export function CameraForm({ editing, onSaved, onCancel }) {
+export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 	const [base, setBase] = useState(editing);
 	const [fields, setFields] = useState(/** @type {Fields} */ (editing ? fieldsOf(editing) : BLANK));
-	const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
+	const [problem, setProblem] = useProblem();
 	const [told, setTold] = useState(/** @type {string[]} */ ([]));
 	const [theirs, setTheirs] = useState(/** @type {any | null} */ (null));
 	const [isSaving, setIsSaving] = useState(false);
@@ -29,12 +36,13 @@ export function CameraForm({ editing, onSaved, onCancel }) {
 	const faults = [...previewFaults, ...(problem?.errors ?? [])];
 	const missing = missingOf(fields);
 
-	useEffect(() => title.current?.focus(), []);
+	useEffect(() => arriveAt(title.current), []);
 
 	/** @param {Fields} changed */
 	function change(changed) {
 		setFields((before) => ({ ...before, ...changed }));
 		setProblem(null);
+		onTyped();
 	}
 
 	/** @param {number | null} revision that is replaced; null for a new camera */
@@ -47,7 +55,7 @@ export function CameraForm({ editing, onSaved, onCancel }) {
 		} catch (error) {
 			if (!(error instanceof Problem)) throw error;
 			if (error.status === 412) await showTheirs();
-			else setProblem(nameTaken(error));
+			else setProblem(error);
 		} finally {
 			setIsSaving(false);
 		}
@@ -71,6 +79,7 @@ export function CameraForm({ editing, onSaved, onCancel }) {
 			const draft = await getJson("cameras/from-photo", { method: "POST", headers, body: file });
 			setTold(draft.warnings);
 			setFields((before) => filledIn(before, draft));
+			onTyped();
 			setProblem(null);
 		} catch (error) {
 			setProblem(problemOf(error));
@@ -116,7 +125,7 @@ export function CameraForm({ editing, onSaved, onCancel }) {
 				<input type="file" accept=${PHOTOGRAPHS} onChange=${fillFromPhotograph} />
 				<span class="hint">Its EXIF tells lens and sensor. The photograph is not kept.</span>
 			</label>
-			${told.length > 0 && html`<ul class="notice plain" role="status">${told.map((words) => html`<li>${words}</li>`)}</ul>`}
+			${told.length > 0 && html`<div role="status"><${Warnings} texts=${told} /></div>`}
 			<div class="pair">
 				${field("name", "Name", { disabled: base !== null, kind: "text", hint: "letters, digits, dots, dashes" })}
 				${field("focus_distance_m", "Focus distance (m)", { hint: "from the lens to what is sharp" })}
@@ -140,7 +149,7 @@ export function CameraForm({ editing, onSaved, onCancel }) {
 						${field("lens/focal_length_mm", "Focal length (mm)", { hint: "the real one, never the 35-mm equivalent" })}
 						${field("lens/f_number", "f-number")}
 						${field("lens/pixel_pitch_um", "Pixel pitch (µm)", { hint: "of one sensor pixel" })}
-						${field("lens/sensor_width_px", "Sensor width (px)", { hint: "of the whole sensor, along the image width" })}
+						${field("lens/sensor_width_px", "Sensor width (px)", { hint: SENSOR_WIDTH })}
 					</div>`
 				: html`<div class="pair">
 						${field("k_cam_px", "k_cam (px)", { hint: "blur per unit of relative defocus, at the image width" })}
@@ -176,13 +185,13 @@ export function CameraForm({ editing, onSaved, onCancel }) {
 }
 
 /**
- * @param {{path: string, label: string, value: string, kind?: string, hint?: string, disabled?: boolean,
+ * @param {{path: string, label: string, value: string, form?: string, kind?: string, hint?: string, disabled?: boolean,
  *   faults: import("./api.js").FieldProblem[], onChange: (changed: Fields) => void}} props
  */
-function Field({ path, label, value, kind = "decimal", hint, disabled = false, faults, onChange }) {
+export function Field({ path, label, value, form = "camera", kind = "decimal", hint, disabled = false, faults, onChange }) {
 	const fault = faults.find(({ pointer }) => pointer === `#/${path}` || pointer.startsWith(`#/${path}/`))?.detail;
 	return html`<${TextField}
-		...${{ id: `camera-${path.replace("/", "-")}`, label, value, kind, fault, hint, disabled }}
+		...${{ id: `${form}-${path.replace("/", "-")}`, label, value, kind, fault, hint, disabled }}
 		onInput=${(/** @type {string} */ text) => onChange({ [path]: text })}
 	/>`;
 }
@@ -252,10 +261,4 @@ function usePreview(fields) {
 		};
 	}, [body]);
 	return seen;
-}
-
-/** @param {Problem} problem @returns {Problem} with the name marked, where it is taken */
-function nameTaken(problem) {
-	if (problem.status === 409) problem.errors = [{ pointer: "#/name", detail: "This name is taken." }];
-	return problem;
 }

@@ -19,6 +19,19 @@ const NEEDED_OF_LENS = {
 	"lens/sensor_width_px": "sensor width",
 };
 
+/** What is asked for as a sensor's width. */
+export const SENSOR_WIDTH = "pixels across the full-size photograph the camera takes";
+
+/** Times the focus distance: what is nearer or farther has no answer (the model's `depth_ratio`). */
+const ANSWERED = [0.15, 8];
+
+/** @param {any} camera as the API reads or previews it @returns {[number, number] | null} where its depths are good, in metres */
+export function usableM({ range_m, focus_distance_m }) {
+	const near = Math.max(range_m.near, ANSWERED[0] * focus_distance_m);
+	const far = Math.min(range_m.far, ANSWERED[1] * focus_distance_m);
+	return near < far ? [near, far] : null;
+}
+
 /** The fields of a camera that is not there yet. @type {Fields} */
 export const BLANK = { "by": "lens", "gamma_px": "0.5", "lens/k_r": "4" };
 
@@ -49,8 +62,8 @@ export function fieldsOf(camera) {
 }
 
 /**
- * The fields with what a photograph tells. It tells neither gamma nor k_r, which may have been measured, and of intrinsics
- * not the ones of another picture size.
+ * The fields with what a photograph tells. It tells neither gamma nor k_r, which may have been measured, of intrinsics
+ * not the ones of another picture size, and of the sensor's width nothing that is not more than its own.
  *
  * @param {Fields} before
  * @param {any} draft
@@ -61,6 +74,8 @@ export function filledIn(before, draft) {
 	const isAnotherSize = SIZE.some((name) => before[name] && before[name] !== told[name]);
 	const kept = Object.entries(before).filter(([path]) => !(isAnotherSize && path.startsWith("intrinsics/")));
 	const { gamma_px, "lens/k_r": k_r } = { ...BLANK, ...before };
+	const sensor = "lens/sensor_width_px";
+	if (before[sensor] && !(draft.lens.sensor_width_px > draft.image_width_px)) told[sensor] = before[sensor];
 	return { ...Object.fromEntries(kept), ...told, gamma_px, "lens/k_r": k_r, by: "lens" };
 }
 

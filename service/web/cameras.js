@@ -1,12 +1,12 @@
 /** The cameras: listed, read with their curve and revisions, made, changed, deleted, exported and imported. */
 
-import { Problem, getJson, problemOf, request } from "./api.js";
+import { getJson, problemOf, request } from "./api.js";
 import { CameraCurve } from "./camera_curve.js";
 import { ImportDialog, exportCameras } from "./camera_files.js";
-import { CameraForm } from "./camera_form.js";
+import { CameraForm, arriveAt } from "./camera_form.js";
 import { differences } from "./camera_specs.js";
 import { counted, short, when } from "./numbers.js";
-import { ProblemBox } from "./problem_box.js";
+import { ProblemBox, useProblem } from "./problem_box.js";
 import { html, useEffect, useMemo, useRef, useState } from "./vendor/preact.js";
 
 const A_PAGE = 20;
@@ -28,14 +28,47 @@ export function CamerasView({ shown, cameras, camera, reloadCameras, go, announc
 	);
 	const read = open.kind === "read" ? cameras?.find(({ name }) => name === open.name) : null;
 
+	const isTyped = useRef(false);
+
 	useEffect(() => {
-		if (shown && camera) setOpen({ kind: "read", name: camera });
+		const { kind } = open;
+		const name = kind === "read" ? open.name : kind === "edit" ? open.camera.name : null;
+		if (!shown || name === camera) return;
+		if (mayLeave()) show(camera);
+		else go("cameras", { camera: name, replaces: true });
 	}, [shown, camera]);
+
+	/** Whether a form may go, with what was typed into it. */
+	const mayLeave = () => !isTyped.current || confirm("Throw away what you have typed?");
+
+	/** @param {Open} next */
+	function turnTo(next) {
+		isTyped.current = false;
+		setOpen(next);
+	}
+
+	/** @param {string | null} name */
+	function show(name) {
+		turnTo(name ? { kind: "read", name } : { kind: "none" });
+		go("cameras", { camera: name, replaces: true });
+	}
+
+	function begin() {
+		if (open.kind === "new" || !mayLeave()) return;
+		turnTo({ kind: "new" });
+		go("cameras");
+	}
+
+	/** @param {string} name */
+	function choose(name) {
+		if (name !== camera) go("cameras", { camera: name });
+		else if (mayLeave()) show(name);
+	}
 
 	/** @param {string | null} name of the camera to show then @param {string} words */
 	async function changed(name, words) {
 		await reloadCameras();
-		setOpen(name ? { kind: "read", name } : { kind: "none" });
+		show(name);
 		announce(words);
 	}
 
@@ -44,7 +77,7 @@ export function CamerasView({ shown, cameras, camera, reloadCameras, go, announc
 			<div class="row ends">
 				<h2>Cameras</h2>
 				<div class="row">
-					<button type="button" class="primary" onClick=${() => setOpen({ kind: "new" })}>New camera</button>
+					<button type="button" class="primary" onClick=${begin}>New camera</button>
 					<button type="button" onClick=${() => importing.current?.click()}>Import</button>
 					<button type="button" disabled=${!cameras?.length} onClick=${() => exportCameras(cameras ?? [], "cameras")}>
 						Export all
@@ -55,10 +88,9 @@ export function CamerasView({ shown, cameras, camera, reloadCameras, go, announc
 						accept=".json,application/json"
 						hidden
 						aria-label="Cameras to import"
-						onChange=${(/** @type {Event} */ event) => {
-							const input = /** @type {HTMLInputElement} */ (event.target);
-							setFile(input.files?.[0] ?? null);
-							input.value = "";
+						onChange=${(/** @type {any} */ { target }) => {
+							setFile(target.files[0] ?? null);
+							target.value = "";
 						}}
 					/>
 				</div>
@@ -71,12 +103,7 @@ export function CamerasView({ shown, cameras, camera, reloadCameras, go, announc
 					${(filter || (cameras?.length ?? 0) > A_PAGE / 2) &&
 					html`<label class="field">
 						Find
-						<input
-							type="search"
-							value=${filter}
-							onInput=${(/** @type {any} */ event) =>
-								setFilter(event.target.value)}
-						/>
+						<input type="search" value=${filter} onInput=${(/** @type {any} */ event) => setFilter(event.target.value)} />
 					</label>`}
 					${found.length > 0 &&
 					html`<ul class="camera-list">
@@ -85,7 +112,7 @@ export function CamerasView({ shown, cameras, camera, reloadCameras, go, announc
 								<button
 									type="button"
 									aria-pressed=${open.kind === "read" && open.name === one.name}
-									onClick=${() => setOpen({ kind: "read", name: one.name })}
+									onClick=${() => choose(one.name)}
 								>
 									<span class="name">${one.name}</span>
 									<span class="hint">
@@ -111,14 +138,18 @@ export function CamerasView({ shown, cameras, camera, reloadCameras, go, announc
 						key=${open.kind === "edit" ? open.camera.name : ""}
 						editing=${open.kind === "edit" ? open.camera : null}
 						onSaved=${(/** @type {any} */ stored, /** @type {string} */ words) => changed(stored.name, words)}
-						onCancel=${() => setOpen(open.kind === "edit" ? { kind: "read", name: open.camera.name } : { kind: "none" })}
+						onTyped=${() => {
+							isTyped.current = true;
+						}}
+						onCancel=${() => show(open.kind === "edit" ? open.camera.name : null)}
 					/>`}
 					${read &&
 					html`<${CameraCard}
 						key=${`${read.name} ${read.revision}`}
 						camera=${read}
+						opened=${open}
 						go=${go}
-						onEdit=${() => setOpen({ kind: "edit", camera: read })}
+						onEdit=${() => turnTo({ kind: "edit", camera: read })}
 						onDeleted=${() => changed(null, `Camera ${read.name} is deleted.`)}
 						onStale=${reloadCameras}
 					/>`}
@@ -137,18 +168,26 @@ export function CamerasView({ shown, cameras, camera, reloadCameras, go, announc
 }
 
 /**
- * @param {{camera: any, go: import("./app.js").ViewProps["go"], onEdit: () => void, onDeleted: () => void,
+ * @param {{camera: any, opened: Open, go: import("./app.js").ViewProps["go"], onEdit: () => void, onDeleted: () => void,
  *   onStale: () => void}} props `onStale` is for when the service has another revision
  */
-function CameraCard({ camera, go, onEdit, onDeleted, onStale }) {
+function CameraCard({ camera, opened, go, onEdit, onDeleted, onStale }) {
 	const path = `cameras/${encodeURIComponent(camera.name)}`;
-	const { answer: curve, problem } = useAnswer(`${path}/curve`);
+	const [curve, setCurve] = useState(/** @type {any} */ (null));
+	const [problem, setProblem] = useProblem();
 	const [isDeleting, setIsDeleting] = useState(false);
 	const { lens, intrinsics } = camera;
+	const title = useRef(/** @type {HTMLHeadingElement | null} */ (null));
+	useEffect(() => arriveAt(title.current), [opened]);
+	useEffect(() => {
+		const stop = new AbortController();
+		getJson(`${path}/curve`, { signal: stop.signal }).then(setCurve, (error) => stop.signal.aborted || setProblem(error));
+		return () => stop.abort();
+	}, []);
 	return html`
 		<article class="card" aria-labelledby="camera-title">
 			<div class="row ends">
-				<h3 id="camera-title">${camera.name}</h3>
+				<h3 id="camera-title" tabindex="-1" ref=${title}>${camera.name}</h3>
 				<span class="row">
 					<span class="badge">${SOURCES[camera.source]}</span>
 					<span class="badge">revision ${camera.revision}</span>
@@ -190,7 +229,7 @@ function CameraCard({ camera, go, onEdit, onDeleted, onStale }) {
 function Revisions({ path }) {
 	const [items, setItems] = useState(/** @type {any[]} */ ([]));
 	const [cursor, setCursor] = useState(/** @type {string | null} */ (null));
-	const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
+	const [problem, setProblem] = useProblem();
 
 	/** @param {string | null} after */
 	async function load(after) {
@@ -239,7 +278,7 @@ function changesOf(before, after) {
 /** @param {{camera: any, path: string, onClose: () => void, onDeleted: () => void, onStale: () => void}} props */
 function DeleteDialog({ camera, path, onClose, onDeleted, onStale }) {
 	const dialog = useRef(/** @type {HTMLDialogElement | null} */ (null));
-	const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
+	const [problem, setProblem] = useProblem();
 	useEffect(() => dialog.current?.showModal(), []);
 
 	async function remove() {
@@ -258,26 +297,14 @@ function DeleteDialog({ camera, path, onClose, onDeleted, onStale }) {
 			<div class="stack">
 				<h2 id="delete-title">Delete ${camera.name}?</h2>
 				<p>Photographs can no longer be sent with this camera. Its name is free again, and its revisions are kept.</p>
-				<${ProblemBox} problem=${problem} onRetry=${[404, 412].includes(problem?.status ?? 0) ? onStale : undefined} />
+				<${ProblemBox} problem=${problem} />
 				<div class="row">
-					<button type="button" class="danger" onClick=${remove}>Delete ${camera.name}</button>
+					${[404, 412].includes(problem?.status ?? 0)
+						? html`<button type="button" class="primary" onClick=${onStale}>See how it is now</button>`
+						: html`<button type="button" class="danger" onClick=${remove}>Delete ${camera.name}</button>`}
 					<button type="button" onClick=${() => dialog.current?.close()}>Keep it</button>
 				</div>
 			</div>
 		</dialog>
 	`;
-}
-
-/** @param {string} path @returns {{answer: any | null, problem: Problem | null}} */
-function useAnswer(path) {
-	const [state, setState] = useState({ answer: /** @type {any} */ (null), problem: /** @type {Problem | null} */ (null) });
-	useEffect(() => {
-		const stop = new AbortController();
-		getJson(path, { signal: stop.signal }).then(
-			(answer) => setState({ answer, problem: null }),
-			(problem) => !stop.signal.aborted && setState({ answer: null, problem }),
-		);
-		return () => stop.abort();
-	}, [path]);
-	return state;
 }

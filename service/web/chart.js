@@ -56,18 +56,14 @@ export function Chart({ title, x, y, series, marks = [] }) {
 					</g>`,
 				)}
 				<line class="axis" x1=${LEFT} x2=${width - RIGHT} y1=${HEIGHT - BOTTOM} y2=${HEIGHT - BOTTOM} />
-				${marks.map(
-					(mark, row) => html`<g class="mark">
-						<line x1=${across.scale(mark.x)} x2=${across.scale(mark.x)} y1=${TOP} y2=${HEIGHT - BOTTOM} />
-						<text
-							x=${across.scale(mark.x) + (across.scale(mark.x) > width / 2 ? -5 : 5)}
-							y=${TOP + 10 + row * LINE}
-							text-anchor=${across.scale(mark.x) > width / 2 ? "end" : "start"}
-						>
-							${mark.label}
-						</text>
-					</g>`,
-				)}
+				${marks.map((mark, row) => {
+					const at = across.scale(mark.x);
+					const [aside, anchor] = at > width / 2 ? [-5, "end"] : [5, "start"];
+					return html`<g class="mark">
+						<line x1=${at} x2=${at} y1=${TOP} y2=${HEIGHT - BOTTOM} />
+						<text x=${at + aside} y=${TOP + 10 + row * LINE} text-anchor=${anchor}>${mark.label}</text>
+					</g>`;
+				})}
 				${series.map((one) => drawn(one, across.scale, up.scale))}
 				<text x=${width - RIGHT} y=${HEIGHT - 6} text-anchor="end">${x.label} (${x.unit})</text>
 				<text x=${12} y=${TOP} transform=${`rotate(-90 12 ${TOP})`} text-anchor="end">

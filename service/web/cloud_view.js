@@ -56,7 +56,7 @@ export function CloudView({ reader, result, look, hasPhotograph, isShown }) {
 			<p>
 				${hasPoints
 					? "This browser has no WebGL2, or no graphics to draw it with. The points are there as PLY, to download."
-					: "Points in space need the camera's focal length: give the camera its lens or its intrinsics."}
+					: "Points in space need the camera's focal length."}
 			</p>
 		</div>`;
 	}
@@ -156,8 +156,8 @@ function handle(canvas, tell) {
 			"+": () => zoom(ZOOM),
 			"=": () => zoom(ZOOM),
 			"-": () => zoom(1 / ZOOM),
-			0: () => reset(),
-			Home: () => reset(),
+			0: reset,
+			Home: reset,
 		};
 		if (!(event.key in keys) || event.altKey || event.ctrlKey || event.metaKey) return;
 		event.preventDefault();

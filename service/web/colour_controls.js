@@ -1,6 +1,8 @@
 /** Which colours the depth has, from where to where, and what is marked on it. */
 
 import { MAPS } from "./colours.js";
+import { toMetres } from "./numbers.js";
+import { Choice } from "./text_field.js";
 import { html, useState } from "./vendor/preact.js";
 
 /** @typedef {import("./maps.js").Look} Look */
@@ -14,12 +16,7 @@ export function Colours({ look, facts, onLook }) {
 	const change = (/** @type {Partial<Look>} */ part) => onLook({ ...look, ...part });
 	return html`<section class="card stack" aria-label="Colours">
 		<h3>Colours</h3>
-		<label class="field"
-			>Map
-			<select value=${look.map} onChange=${(/** @type {any} */ event) => change({ map: event.target.value })}>
-				${MAPS.map(([value, title]) => html`<option key=${value} value=${value}>${title}</option>`)}
-			</select>
-		</label>
+		<${Choice} label="Map" value=${look.map} options=${MAPS} onChange=${(/** @type {Look["map"]} */ map) => change({ map })} />
 		${spread &&
 		html`
 			<${Bound} title="Near" value=${look.nearM} ...${spread}
@@ -55,15 +52,15 @@ function Bound({ title, value, leastM, mostM, onValue }) {
 			onInput=${(/** @type {any} */ event) => onValue(leastM * Math.exp((span * event.target.value) / STEPS))}
 		/>
 		<input
-			type="number"
-			step="any"
-			min="0.001"
+			type="text"
+			inputmode="decimal"
 			value=${typed ?? value.toFixed(3)}
 			aria-label=${`${title} end of the colours, metres`}
 			onInput=${(/** @type {any} */ event) => setTyped(event.target.value)}
 			onChange=${(/** @type {any} */ event) => {
 				setTyped(null);
-				if (event.target.value > 0) onValue(Number(event.target.value));
+				const metres = toMetres(event.target.value);
+				if (metres) onValue(metres);
 			}}
 		/>
 		<span>m</span>

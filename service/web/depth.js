@@ -1,19 +1,21 @@
 /** The depth view: a camera, a photograph, and the metres in it. */
 
 import { Problem, upload } from "./api.js";
+import { usableM } from "./camera_specs.js";
 import { CloudView } from "./cloud_view.js";
 import { depthPath } from "./commands.js";
 import { Colours } from "./colour_controls.js";
 import { DraftForm } from "./draft_form.js";
 import { Exports } from "./exports.js";
 import { Legend } from "./legend.js";
-import { short } from "./numbers.js";
+import { short, toMetres } from "./numbers.js";
 import { PHOTOGRAPHS, mediaTypeOf, readShown } from "./photograph_files.js";
-import { ProblemBox } from "./problem_box.js";
+import { ProblemBox, Warnings, useProblem } from "./problem_box.js";
 import { DepthReader } from "./reader.js";
 import { Distance, Readout, Timings, metres } from "./readout.js";
 import { Stage } from "./stage.js";
 import { Tape } from "./tape.js";
+import { Choice, TextField } from "./text_field.js";
 import { html, useCallback, useEffect, useMemo, useRef, useState } from "./vendor/preact.js";
 
 /** @typedef {import("./maps.js").Facts} Facts */
@@ -34,7 +36,7 @@ import { html, useCallback, useEffect, useMemo, useRef, useState } from "./vendo
  */
 
 /** @typedef {{distanceM: number, sigmaM: number} | "unknown"} Measured */
-/** @typedef {{step: "upload", fraction: number | null} | {step: "work", since: number} | {step: "draw"}} Phase */
+/** @typedef {{step: "upload" | "receive", fraction: number | null} | {step: "work", since: number} | {step: "draw"}} Phase */
 
 const SIDES = [
 	["auto", "Let the model decide"],
@@ -55,12 +57,13 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 	);
 	const [name, setName] = useState("");
 	const [side, setSide] = useState("auto");
+	const [focus, setFocus] = useState("");
 	const [focusM, setFocusM] = useState(/** @type {number | null} */ (null));
 	const [known, setKnown] = useState(/** @type {KnownDepth[]} */ ([]));
 	const [attempt, setAttempt] = useState(0);
 	const [isDrafting, setIsDrafting] = useState(false);
 	const [phase, setPhase] = useState(/** @type {Phase | null} */ (null));
-	const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
+	const [problem, setProblem] = useProblem();
 	const [result, setResult] = useState(/** @type {Result | null} */ (null));
 	const [look, setLook] = useState(FIRST_LOOK);
 	const [isOpening, setIsOpening] = useState(false);
@@ -76,8 +79,16 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 	const ask = { camera: name, side, focusM, known };
 
 	useEffect(() => {
-		if (brought !== null) setName(brought);
+		if (brought === null || brought === name) return;
+		setName(brought);
+		setIsDrafting(false);
+		forgetFocus();
 	}, [brought]);
+
+	function forgetFocus() {
+		setFocus("");
+		setFocusM(null);
+	}
 
 	const take = useCallback(async (/** @type {File | null | undefined} */ taken) => {
 		if (!taken) return;
@@ -85,6 +96,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 		setReading(null);
 		setMarks([]);
 		setKnown([]);
+		forgetFocus();
 		setPhotograph(null);
 		setIsOpening(true);
 		setIsDrafting(false);
@@ -142,6 +154,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 				signal,
 				onProgress: (fraction) =>
 					show(fraction === 1 ? { step: "work", since: performance.now() } : { step: "upload", fraction }),
+				onReceived: (fraction) => show({ step: "receive", fraction }),
 			});
 			show({ step: "draw" });
 			const facts = await reader.ask("load", { npz: answer.body });
@@ -169,7 +182,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 			if (signal.aborted) return;
 			setResult(null);
 			setPhase(null);
-			setProblem(error instanceof Problem ? error : unreadable(error));
+			setProblem(error instanceof Problem ? withSize(error) : unreadable(error));
 		}
 	}
 
@@ -198,10 +211,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 						<select
 							value=${camera ? name : ""}
 							aria-invalid=${isNotTheFrame}
-							onChange=${(/** @type {any} */ event) => {
-								setIsDrafting(false);
-								setName(event.target.value);
-							}}
+							onChange=${(/** @type {any} */ event) => go("depth", { camera: event.target.value, replaces: true })}
 						>
 							<option value="" disabled>${cameras === null ? "Loading…" : "Choose the camera that took it"}</option>
 							${(cameras ?? []).map((one) => html`<option key=${one.name} value=${one.name}>${one.name}</option>`)}
@@ -215,14 +225,14 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 					</p>`}
 					<${Warnings} texts=${warned("camera")} />
 				</div>
-				<label class="field"
-					>Side of the plane in focus
-					<select value=${side} onChange=${(/** @type {any} */ event) => setSide(event.target.value)}>
-						${SIDES.map(([value, says]) => html`<option key=${value} value=${value}>${says}</option>`)}
-					</select>
-				</label>
+				<${Choice} label="Side of the plane in focus" value=${side} options=${SIDES} onChange=${setSide} />
 				<div class="stack">
-					<${FocusField} camera=${camera} onFocusM=${setFocusM} />
+					<${TextField}
+						...${{ id: "depth-focus", label: "Focus distance of this shot, m", kind: "decimal", value: focus, onInput: setFocus }}
+						fault=${toMetres(focus) === undefined ? "This is no distance in metres." : ""}
+						hint=${camera ? `Left empty, the camera's: ${short(camera.focus_distance_m, 4)} m.` : ""}
+						onChange=${(/** @type {string} */ text) => toMetres(text) !== undefined && setFocusM(toMetres(text) ?? null)}
+					/>
 					<${Warnings} texts=${warned("focus")} />
 				</div>
 				<${FileButtons} hasFile=${file !== null} onFile=${take} />
@@ -230,14 +240,16 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 
 			<${ProblemBox}
 				problem=${problem}
-				onRetry=${problem && !isNotTheFrame && file && camera ? again : undefined}
-				onClose=${problem ? () => setProblem(null) : undefined}
+				onRetry=${file && camera ? again : undefined}
+				onClose=${() => setProblem(null)}
 			/>
 			${isNotTheFrame &&
 			!isDrafting &&
-			html`<div class="row">
-				<button type="button" onClick=${() => setIsDrafting(true)}>Draft a camera from this photograph</button>
-			</div>`}
+			html`<p>
+				If it is the whole frame of another camera,${" "}
+				<button type="button" class="depth-link" onClick=${() => setIsDrafting(true)}>draft a camera from this photograph</button>.
+				From a crop every depth would be wrong.
+			</p>`}
 			${wantsDraft &&
 			html`<${DraftForm}
 				key=${file}
@@ -245,9 +257,8 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 				mediaType=${mediaTypeOf(/** @type {File} */ (file))}
 				onStored=${async (/** @type {string} */ stored) => {
 					await reloadCameras();
-					setIsDrafting(false);
 					setProblem(null);
-					setName(stored);
+					go("depth", { camera: stored, replaces: true });
 				}}
 			/>`}
 			<${Progress} phase=${phase} onCancel=${cancel} />
@@ -308,20 +319,15 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 function useFilesFromOutside(shown, take) {
 	useEffect(() => {
 		if (!shown) return undefined;
-		const drop = (/** @type {DragEvent} */ event) => {
-			if (!event.dataTransfer?.files.length) return;
-			event.preventDefault();
-			take(event.dataTransfer.files[0]);
-		};
-		const paste = (/** @type {ClipboardEvent} */ event) => {
-			take(Array.from(event.clipboardData?.files ?? []).find((file) => file.type.startsWith("image/")));
-		};
-		document.addEventListener("drop", drop);
-		document.addEventListener("paste", paste);
-		return () => {
-			document.removeEventListener("drop", drop);
-			document.removeEventListener("paste", paste);
-		};
+		const end = new AbortController();
+		const { signal } = end;
+		document.addEventListener("drop", ({ dataTransfer }) => take(dataTransfer?.files[0]), { signal });
+		document.addEventListener(
+			"paste",
+			({ clipboardData }) => take(Array.from(clipboardData?.files ?? []).find(({ type }) => type.startsWith("image/"))),
+			{ signal },
+		);
+		return () => end.abort();
 	}, [shown]);
 }
 
@@ -361,28 +367,6 @@ function FileButtons({ hasFile, onFile }) {
 		<input ref=${chosen} type="file" accept=${PHOTOGRAPHS} hidden onChange=${onChange} />
 		<input ref=${taken} type="file" accept="image/*" capture="environment" hidden onChange=${onChange} />
 	</div>`;
-}
-
-/** @param {{camera: any, onFocusM: (focusM: number | null) => void}} props */
-function FocusField({ camera, onFocusM }) {
-	const [isWrong, setIsWrong] = useState(false);
-	return html`<label class="field"
-		>Focus distance of this shot, m
-		<input
-			type="number"
-			min="0.001"
-			step="any"
-			inputmode="decimal"
-			placeholder=${camera ? `${short(camera.focus_distance_m, 4)}, the camera's` : "the camera's"}
-			aria-invalid=${isWrong}
-			onChange=${(/** @type {any} */ event) => {
-				const { value, validity } = event.target;
-				setIsWrong(!validity.valid);
-				if (validity.valid) onFocusM(value === "" ? null : Number(value));
-			}}
-		/>
-		${isWrong && html`<span class="fault" role="alert">This is no distance in metres.</span>`}
-	</label>`;
 }
 
 /** @param {{picture: string, onPicture: (picture: string) => void}} props */
@@ -426,8 +410,11 @@ function Progress({ phase, onCancel }) {
 		return () => clearInterval(timer);
 	}, [isWorking]);
 	if (phase === null) return null;
+	const fraction = "fraction" in phase ? phase.fraction : null;
+	const part = fraction ? ` ${Math.round(100 * fraction)} %` : "";
 	const says = {
-		upload: () => `Sending${phase.step === "upload" && phase.fraction ? ` ${Math.round(100 * phase.fraction)} %` : ""}`,
+		upload: () => `Sending${part}`,
+		receive: () => `Receiving the answer${part}`,
 		work: () =>
 			phase.step === "work" && `Waiting for a slot, reading the blur: ${((performance.now() - phase.since) / 1000).toFixed(1)} s`,
 		draw: () => "Drawing",
@@ -436,19 +423,11 @@ function Progress({ phase, onCancel }) {
 		<progress
 			key=${phase.step}
 			aria-label="Progress"
-			value=${phase.step === "upload" && phase.fraction !== null ? phase.fraction : undefined}
+			value=${fraction ?? undefined}
 		></progress>
 		<span class="number">${says()}</span>
 		<button type="button" onClick=${onCancel}>Cancel</button>
 	</div>`;
-}
-
-/** @param {{texts: string[]}} props */
-function Warnings({ texts }) {
-	if (texts.length === 0) return null;
-	return html`<ul class="notice depth-warnings">
-		${texts.map((text) => html`<li key=${text}>${text.replace(/^[a-z](?!\w*_)/, (one) => one.toUpperCase())}</li>`)}
-	</ul>`;
 }
 
 /** @param {string} text @returns {"camera" | "focus" | "result"} beside what it should be read */
@@ -458,15 +437,27 @@ function placeOfWarning(text) {
 }
 
 /** @param {any} camera */
-function about({ image_width_px, image_height_px, focus_distance_m, range_m, description }) {
-	const range = `reads up to ${short(range_m.far, 2)} m well`;
-	const numbers = `${image_width_px} × ${image_height_px} px, focused at ${short(focus_distance_m, 4)} m, ${range}`;
+function about(camera) {
+	const { image_width_px, image_height_px, focus_distance_m, description } = camera;
+	const range = usableM(camera);
+	const reads = range ? `reads ${short(range[0], 2)} to ${short(range[1], 2)} m well` : "reads no depth well";
+	const numbers = `${image_width_px} × ${image_height_px} px, focused at ${short(focus_distance_m, 4)} m, ${reads}`;
 	return description ? `${description}. ${numbers}` : numbers;
 }
 
 /** @param {string} header `decode;dur=1.2, wait;dur=0.1` @returns {[string, number][]} */
 function readTimings(header) {
 	return Array.from(header.matchAll(/([\w-]+);dur=([\d.]+)/g), ([, stage, ms]) => [stage, Number(ms)]);
+}
+
+/** @param {Problem} problem @returns {Problem} with the size that would do, where the picture has too many pixels */
+function withSize(problem) {
+	const told = /(\d+)x(\d+) pixels, more than the (\d+) /.exec(problem.detail);
+	if (problem.status !== 413 || told === null) return problem;
+	const [width, height, most] = told.slice(1).map(Number);
+	const scale = Math.sqrt(most / (width * height));
+	const size = `${Math.floor(width * scale)}x${Math.floor(height * scale)}`;
+	return new Problem({ ...problem, detail: `${problem.detail} Make it ${size} or smaller: the camera need not change.` });
 }
 
 /** @param {unknown} error */

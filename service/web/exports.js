@@ -1,17 +1,18 @@
 /** The answer as a file in every format, and the request for it as something to paste. */
 
-import { Problem, getBlob, problemOf, storedKey } from "./api.js";
+import { getBlob, problemOf, storedKey } from "./api.js";
 import { FORMATS, answerName, curlCommand, depthPath, pythonCommand } from "./commands.js";
 import { mediaTypeOf } from "./photograph_files.js";
-import { ProblemBox } from "./problem_box.js";
+import { ProblemBox, useProblem } from "./problem_box.js";
 import { save } from "./save.js";
+import { Choice } from "./text_field.js";
 import { html, useState } from "./vendor/preact.js";
 
 /** @param {{result: import("./depth.js").Result, announce: (text: string) => void}} props */
 export function Exports({ result: { asked, file, npz }, announce }) {
 	const [format, setFormat] = useState("png");
 	const [isBusy, setIsBusy] = useState(false);
-	const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
+	const [problem, setProblem] = useProblem();
 	const [copied, setCopied] = useState(/** @type {{text: string, isCopied: boolean} | null} */ (null));
 	const path = depthPath({ ...asked, format });
 	const mediaType = mediaTypeOf(file);
@@ -21,7 +22,9 @@ export function Exports({ result: { asked, file, npz }, announce }) {
 		setIsBusy(true);
 		setProblem(null);
 		try {
-			save(format === "npz" ? npz : await fetched(), answer);
+			// the service keeps no photograph: it is sent again
+			const asked = { method: "POST", body: file, headers: { "Content-Type": mediaType } };
+			save(format === "npz" ? npz : await getBlob(path, asked), answer);
 			announce(`${answer} is downloaded.`);
 		} catch (error) {
 			setProblem(problemOf(error));
@@ -29,9 +32,6 @@ export function Exports({ result: { asked, file, npz }, announce }) {
 			setIsBusy(false);
 		}
 	}
-
-	// the service keeps no photograph: it is sent again
-	const fetched = () => getBlob(path, { method: "POST", body: file, headers: { "Content-Type": mediaType } });
 
 	/** @param {typeof curlCommand} write */
 	async function copy(write) {
@@ -49,18 +49,15 @@ export function Exports({ result: { asked, file, npz }, announce }) {
 
 	return html`<section class="card stack" aria-label="Take it along">
 		<h3>Take it along</h3>
-		<label class="field"
-			>Format
-			<select
-				value=${format}
-				onChange=${(/** @type {any} */ event) => {
-					setFormat(event.target.value);
-					setCopied(null);
-				}}
-			>
-				${Object.entries(FORMATS).map(([value, { says }]) => html`<option key=${value} value=${value}>${says}</option>`)}
-			</select>
-		</label>
+		<${Choice}
+			label="Format"
+			value=${format}
+			options=${Object.entries(FORMATS).map(([value, { says }]) => [value, says])}
+			onChange=${(/** @type {string} */ value) => {
+				setFormat(value);
+				setCopied(null);
+			}}
+		/>
 		<div class="row">
 			<button type="button" disabled=${isBusy} onClick=${download}>${isBusy ? "Asking…" : "Download"}</button>
 			<button type="button" onClick=${() => copy(curlCommand)}>Copy as curl</button>

@@ -22,6 +22,8 @@ const TILTED_DEG = 10;
 const WANTED_TILTED = 3;
 const WANTED_A_SIDE = 2;
 const SIDE = 1.12; // times the focus distance: nearer than 1/1.12 and farther than 1.12 count as a side
+const BLURRED_PX = 1.5;
+const BLUR_RATIO = 2;
 /** @typedef {[number, number]} Between */
 /** @type {Between} */
 const NEARER = [0.6, 0.8];
@@ -73,6 +75,8 @@ export function adviceFor(seen, toldFocus) {
 	if (corner && (left > 0 || seen.length < WANTED + 4)) {
 		return `Next: one with the sheet towards the ${corner}${tilt}.`;
 	}
+	const blur = missingBlur(seen);
+	if (blur) return `Next: one ${blur}${tilt}.`;
 	if (tilt && seen.some((one) => one.tilt !== null)) return `Next: one${tilt}.`;
 	if (left > 0) return `Next: ${left === 1 ? "one more" : `${left} more`}, each at another distance and tilt.`;
 	return "This is a good set: start the calibration.";
@@ -94,6 +98,15 @@ function missingSide(seen, focus) {
 	if (nearer < WANTED_A_SIDE && nearer <= farther) return at(NEARER);
 	if (farther < WANTED_A_SIDE) return at(FARTHER);
 	return nearer < WANTED_A_SIDE ? at(NEARER) : null;
+}
+
+/** @param {Seen[]} seen @returns {string | null} what to take where all are blurred alike, which tells k_cam no more than one */
+function missingBlur(seen) {
+	const blurs = seen.flatMap(({ role, blur }) => (role === "defocused" && blur !== null ? [blur] : []));
+	if (blurs.length === 0) return null;
+	const most = Math.max(...blurs);
+	if (most < BLURRED_PX) return "clearly blurred, with the focus as it is: go much nearer or farther";
+	return most < BLUR_RATIO * Math.min(...blurs) ? "in which the sheet is sharper" : null;
 }
 
 /** @param {Seen} seen the circles' diagonal as a part of the frame's width */

@@ -1,20 +1,22 @@
 /** The third and fourth step: a calibration while it runs, and what it found. */
 
-import { Problem, problemOf, request, sendJson } from "./api.js";
+import { problemOf, request, sendJson } from "./api.js";
 import { Chart } from "./chart.js";
 import { counted, measure, short } from "./numbers.js";
-import { ProblemBox } from "./problem_box.js";
+import { ProblemBox, Warnings, useProblem } from "./problem_box.js";
 import { Table } from "./table.js";
+import { TextField } from "./text_field.js";
 import { html, useEffect, useState } from "./vendor/preact.js";
 
 const MOST_OUTLIERS = 50;
 const MOST_DOTS = 600;
+const VAGUE_RATIO = 2; // of the ends of k_cam's interval
 const ROLES = { focused: "focused on it", defocused: "focus locked" };
 const SPREADS = { disc: "a disc", gaussian: "a Gaussian" };
 
 /** @param {{job: any}} props */
 export function Running({ job }) {
-	const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
+	const [problem, setProblem] = useProblem();
 
 	async function cancel() {
 		try {
@@ -78,19 +80,28 @@ export function Ended({ job, cameras, onAccepted, onDiscard, onAgain, go }) {
 		`;
 	}
 	const { result } = job;
+	const { low, high } = result.k_cam_px;
+	const isVague = !(high <= VAGUE_RATIO * low);
 	const outliers = result.samples.filter((/** @type {any} */ sample) => !sample.used);
 	return html`
 		<div class="stack">
 			<div class="card">
-				<h3>What was found for ${job.camera}</h3>
+				<div class="row ends">
+					<h3>What was found for ${job.camera}</h3>
+					${isVague && html`<span class="badge warn">not determined well</span>`}
+				</div>
 				<dl class="figures">
 					<${Constant} name="k_cam" unit="px" of=${result.k_cam_px} />
 					<${Constant} name="gamma" unit="px" of=${result.gamma_px} />
 					<${Constant} name="Focus distance" unit="m" of=${result.focus_distance_m} />
 				</dl>
-				${result.warnings.length > 0 &&
-				html`<ul class="notice plain">${result.warnings.map((/** @type {string} */ words) => html`<li>${words}</li>`)}</ul>`}
-				<${Accept} job=${job} cameras=${cameras} onAccepted=${onAccepted} onDiscard=${onDiscard} go=${go} />
+				<${Warnings} texts=${result.warnings} />
+				${isVague &&
+				html`<p class="notice">
+					k_cam may be anything from ${short(low)} to ${short(high)} px: add photographs that are clearly blurred, nearer and farther than
+					what is sharp.
+				</p>`}
+				<${Accept} ...${{ job, cameras, isVague, onAccepted, onDiscard, onAgain, go }} />
 			</div>
 			<div class="columns">
 				<div class="card"><${Fit} result=${result} /></div>
@@ -207,10 +218,13 @@ function Outliers({ outliers }) {
 	`;
 }
 
-/** @param {{job: any, cameras: any[] | null, onAccepted: (job: any) => void, onDiscard: () => void, go: import("./app.js").ViewProps["go"]}} props */
-function Accept({ job, cameras, onAccepted, onDiscard, go }) {
+/**
+ * @param {{job: any, cameras: any[] | null, isVague: boolean, onAccepted: (job: any) => void, onDiscard: () => void,
+ *   onAgain: () => void, go: import("./app.js").ViewProps["go"]}} props
+ */
+function Accept({ job, cameras, isVague, onAccepted, onDiscard, onAgain, go }) {
 	const [name, setName] = useState(job.camera);
-	const [problem, setProblem] = useState(/** @type {Problem | null} */ (null));
+	const [problem, setProblem] = useProblem();
 	const there = cameras?.find((camera) => camera.name === name);
 	const fault = problem?.errors.find(({ pointer }) => pointer === "#/camera")?.detail ?? "";
 
@@ -241,24 +255,13 @@ function Accept({ job, cameras, onAccepted, onDiscard, go }) {
 	return html`
 		<form class="stack" onSubmit=${accept}>
 			<${ProblemBox} problem=${fault ? null : problem} />
-			<div class="field">
-				<label for="accept-name">Store it as camera</label>
-				<input
-					id="accept-name"
-					list="camera-names"
-					autocomplete="off"
-					spellcheck=${false}
-					value=${name}
-					aria-invalid=${fault !== ""}
-					aria-describedby="accept-told"
-					onInput=${(/** @type {any} */ event) => setName(event.target.value)}
-				/>
-				<span id="accept-told" class=${fault ? "fault" : "hint"}>
-					${fault || (there ? `It becomes revision ${there.revision + 1} of ${name}; revision ${there.revision} is kept.` : "A new camera.")}
-				</span>
-			</div>
+			<${TextField}
+				...${{ id: "accept-name", label: "Store it as camera", list: "camera-names", value: name, onInput: setName, fault }}
+				hint=${there ? `It becomes revision ${there.revision + 1} of ${name}; revision ${there.revision} is kept.` : "A new camera."}
+			/>
 			<div class="row">
-				<button class="primary" disabled=${name.trim() === ""}>${there ? "Accept as a new revision" : "Accept as a new camera"}</button>
+				${isVague && html`<button type="button" class="primary" onClick=${onAgain}>Back to the photographs</button>`}
+				<button class=${isVague ? "" : "primary"} disabled=${name.trim() === ""}>${there ? "Accept as a new revision" : "Accept as a new camera"}</button>
 				<button type="button" onClick=${onDiscard}>Discard</button>
 			</div>
 		</form>

@@ -21,6 +21,13 @@ export function decimal(text) {
 	return Number(text.replace(",", "."));
 }
 
+/** @param {string} text @returns {number | null | undefined} null for none, undefined for what is no distance */
+export function toMetres(text) {
+	if (text.trim() === "") return null;
+	const value = decimal(text);
+	return Number.isFinite(value) && value > 0 ? value : undefined;
+}
+
 /** @param {string} time in ISO 8601 */
 export function when(time) {
 	return new Date(time).toLocaleString(undefined, { dateStyle: "medium", timeStyle: "short" });

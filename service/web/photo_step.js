@@ -80,10 +80,10 @@ async function lookAt(file, query, signal) {
 }
 
 /**
- * @param {{photos: Photo[], query: string, focus: number | null, onAdd: (photos: Photo[]) => void,
+ * @param {{photos: Photo[], query: string, focus: number | null,
  *   onChange: (change: (before: Photo[]) => Photo[]) => void, announce: (text: string) => void}} props
  */
-export function Photographs({ photos, query, focus, onAdd, onChange, announce }) {
+export function Photographs({ photos, query, focus, onChange, announce }) {
 	const waiting = photos.filter(({ asked }) => asked !== query).length;
 	const seen = photos.filter(({ look }) => look?.found).map(seenOf);
 	const next = adviceFor(seen, focus);
@@ -93,7 +93,7 @@ export function Photographs({ photos, query, focus, onAdd, onChange, announce })
 
 	return html`
 		<div class="columns">
-			${ROLES.map((one) => html`<${DropZone} key=${one.role} ...${one} onFiles=${(/** @type {File[]} */ files) => onAdd(photosOf(files, one.role))} />`)}
+			${ROLES.map((one) => html`<${DropZone} key=${one.role} ...${one} onFiles=${(/** @type {File[]} */ files) => onChange((before) => [...before, ...photosOf(files, one.role)])} />`)}
 		</div>
 		<div class="notice next">
 			<p>
@@ -143,15 +143,11 @@ function DropZone({ role, title, words, onFiles }) {
 	return html`
 		<div
 			class=${`drop ${isOver ? "over" : ""}`}
-			onDragOver=${(/** @type {DragEvent} */ event) => {
-				event.preventDefault();
-				setIsOver(true);
-			}}
+			onDragOver=${() => setIsOver(true)}
 			onDragLeave=${() => setIsOver(false)}
-			onDrop=${(/** @type {DragEvent} */ event) => {
-				event.preventDefault();
+			onDrop=${(/** @type {any} */ { dataTransfer }) => {
 				setIsOver(false);
-				onFiles([...(event.dataTransfer?.files ?? [])]);
+				onFiles([...dataTransfer.files]);
 			}}
 		>
 			<h3>${title}</h3>

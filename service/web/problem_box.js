@@ -1,26 +1,27 @@
-/** What went wrong and what to do about it. */
+/** What went wrong and what to do about it, and what may go wrong. */
 
 import { html, useEffect, useState } from "./vendor/preact.js";
 
 /**
  * @param {{problem: import("./api.js").Problem | null, onRetry?: () => void, onClose?: () => void}} props
- *   renders nothing where there is no problem
+ *   renders nothing where there is no problem, and offers `onRetry` only where that may help
  */
 export function ProblemBox({ problem, onRetry, onClose }) {
 	const waitS = useCountdown(problem);
 	if (problem === null) return null;
-	const { title, detail, errors, requestId } = problem;
+	const { title, detail, errors, requestId, isPassing } = problem;
+	const retry = isPassing ? onRetry : undefined;
 	const isMoreThanDetail = errors.length > 1 || (errors.length === 1 && !detail.includes(errors[0].detail));
 	return html`
 		<div class="problem" role="alert">
 			<p><strong>${title}</strong> ${detail}</p>
 			${isMoreThanDetail &&
-			html`<ul>${errors.map((fault) => html`<li><code>${fault.pointer}</code> ${fault.detail}</li>`)}</ul>`}
+			html`<ul>${errors.map((fault) => html`<li><code>${fault.pointer.replace(/^#\//, "")}</code> ${fault.detail}</li>`)}</ul>`}
 			${requestId && html`<p class="hint" aria-live="off">Request ${requestId}</p>`}
-			${(onRetry || onClose) &&
+			${(retry || onClose) &&
 			html`<div class="row">
-				${onRetry &&
-				html`<button type="button" onClick=${onRetry}>
+				${retry &&
+				html`<button type="button" onClick=${retry}>
 					Try again${waitS > 0 && html`<span aria-hidden="true"> (in ${waitS} s)</span>`}
 				</button>`}
 				${onClose && html`<button type="button" class="quiet" onClick=${onClose}>Dismiss</button>`}
@@ -28,6 +29,16 @@ export function ProblemBox({ problem, onRetry, onClose }) {
 		</div>
 	`;
 }
+
+/** @param {{texts: string[]}} props */
+export function Warnings({ texts }) {
+	if (texts.length === 0) return null;
+	return html`<ul class="notice warnings">
+		${texts.map((text) => html`<li key=${text}>${text.replace(/^[a-z](?!\w*_)/, (one) => one.toUpperCase())}</li>`)}
+	</ul>`;
+}
+
+export const useProblem = () => useState(/** @type {import("./api.js").Problem | null} */ (null));
 
 /** @param {import("./api.js").Problem | null} problem whose wait is counted down, in seconds */
 function useCountdown(problem) {

@@ -75,13 +75,13 @@ export function Timings({ timings, model }) {
 	const totalMs = timings.reduce((sum, [, ms]) => sum + ms, 0);
 	return html`<details class="card">
 		<summary>The service took ${(totalMs / 1000).toFixed(2)} s</summary>
-		<table class="depth-timings">
+		<table>
 			<tbody>
 				${timings.map(
 					([stage, ms]) => html`<tr key=${stage}>
 						<th scope="row">${stage}</th>
 						<td class="number">${ms.toFixed(0)} ms</td>
-						<td><span style=${{ width: `${(100 * ms) / (totalMs || 1)}%` }}></span></td>
+						<td class="bars"><div style=${{ width: `${(100 * ms) / (totalMs || 1)}%` }}></div></td>
 					</tr>`,
 				)}
 			</tbody>

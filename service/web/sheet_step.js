@@ -2,13 +2,21 @@
 
 import { Problem, getBlob, problemOf, storedKey } from "./api.js";
 import { decimal, short } from "./numbers.js";
-import { ProblemBox } from "./problem_box.js";
+import { ProblemBox, useProblem } from "./problem_box.js";
 import { save } from "./save.js";
-import { TextField } from "./text_field.js";
+import { Choice, TextField } from "./text_field.js";
 import { html, useEffect, useState } from "./vendor/preact.js";
 
 const WAIT_MS = 300;
 const RULER_MM = 100;
+const PAPERS = [
+	["a4", "A4"],
+	["letter", "Letter"],
+];
+const GRIDS = [
+	["asymmetric_circles", "every other row shifted"],
+	["symmetric_circles", "in line"],
+];
 
 /**
  * The sheet as it is printed, numbers as they are typed; `ruler_mm` is what the printed ruler of 100 mm measures.
@@ -53,7 +61,7 @@ export function isMeasured({ ruler_mm }) {
 /** @param {{sheet: Sheet, onChange: (sheet: Sheet) => void, onNext: () => void}} props */
 export function SheetStep({ sheet, onChange, onNext }) {
 	const { picture, problem } = usePicture(sheet);
-	const [failed, setFailed] = useState(/** @type {Problem | null} */ (null));
+	const [failed, setFailed] = useProblem();
 	const isNone = problem?.status === 422;
 	const printed = patternOf(sheet);
 	const hasScale = isMeasured(sheet);
@@ -65,6 +73,10 @@ export function SheetStep({ sheet, onChange, onNext }) {
 			invalid=${fault(name) !== "" || (name === "ruler_mm" && !hasScale)}
 			onInput=${(/** @type {string} */ value) => onChange({ ...sheet, [name]: value })}
 		/>
+	`;
+
+	const choice = (/** @type {"paper" | "kind"} */ name, /** @type {string} */ label, /** @type {string[][]} */ options) => html`
+		<${Choice} ...${{ label, options, value: sheet[name] }} onChange=${(/** @type {string} */ value) => onChange({ ...sheet, [name]: value })} />
 	`;
 
 	/** @param {"pdf" | "svg"} kind */
@@ -99,28 +111,7 @@ export function SheetStep({ sheet, onChange, onNext }) {
 				<details>
 					<summary>Another grid or paper</summary>
 					<div class="pair">
-						<label class="field">
-							Paper
-							<select
-								value=${sheet.paper}
-								onChange=${(/** @type {any} */ event) =>
-									onChange({ ...sheet, paper: event.target.value })}
-							>
-								<option value="a4">A4</option>
-								<option value="letter">Letter</option>
-							</select>
-						</label>
-						<label class="field">
-							Grid
-							<select
-								value=${sheet.kind}
-								onChange=${(/** @type {any} */ event) =>
-									onChange({ ...sheet, kind: event.target.value })}
-							>
-								<option value="asymmetric_circles">every other row shifted</option>
-								<option value="symmetric_circles">in line</option>
-							</select>
-						</label>
+						${choice("paper", "Paper", PAPERS)} ${choice("kind", "Grid", GRIDS)}
 						${field("rows", "Rows")} ${field("columns", "Columns")}
 						${field("spacing_mm", "Spacing (mm)")} ${field("diameter_mm", "Diameter (mm)")}
 					</div>

@@ -69,8 +69,10 @@ export function Stage(props) {
 		return () => clearTimeout(timer);
 	}, [reading]);
 
+	const boxOf = () => /** @type {HTMLElement} */ (stage.current).getBoundingClientRect();
+
 	const pixelAt = (/** @type {PointerEvent} */ { clientX, clientY }) => {
-		const box = /** @type {HTMLElement} */ (stage.current).getBoundingClientRect();
+		const box = boxOf();
 		const along = (/** @type {number} */ share, /** @type {number} */ length) =>
 			Math.min(length - 1, Math.max(0, Math.floor(share * length)));
 		return {
@@ -81,7 +83,7 @@ export function Stage(props) {
 
 	/** @param {PointerEvent} event */
 	function onPointerDown(event) {
-		const box = /** @type {HTMLElement} */ (stage.current).getBoundingClientRect();
+		const box = boxOf();
 		const at = box.left + (divider / 100) * box.width;
 		isDragging.current = Math.abs(event.clientX - at) < DIVIDER_REACH_PX;
 		isByKeys.current = false;
@@ -93,7 +95,7 @@ export function Stage(props) {
 	/** @param {PointerEvent} event */
 	function onPointerMove(event) {
 		if (isDragging.current) {
-			const box = /** @type {HTMLElement} */ (stage.current).getBoundingClientRect();
+			const box = boxOf();
 			setDivider(Math.min(100, Math.max(0, (100 * (event.clientX - box.left)) / box.width)));
 		} else {
 			isByKeys.current = false;
@@ -211,6 +213,8 @@ function Bitmap({ bitmap, name }) {
 function Marks({ size, reading, marks, measured, known }) {
 	const x = (/** @type {number} */ u) => `${((100 * (u + 0.5)) / size.width).toFixed(3)}%`;
 	const y = (/** @type {number} */ v) => `${((100 * (v + 0.5)) / size.height).toFixed(3)}%`;
+	const ring = (/** @type {Pixel} */ { u, v }, /** @type {number} */ r, /** @type {string} */ line) =>
+		["rim", line].map((kind) => html`<circle class=${kind} cx=${x(u)} cy=${y(v)} r=${r} />`);
 	const [from, to] = marks;
 	const end = to ?? reading;
 	return html`
@@ -221,14 +225,7 @@ function Marks({ size, reading, marks, measured, known }) {
 				(kind) =>
 					html`<line key=${kind} class=${kind} x1=${x(from.u)} y1=${y(from.v)} x2=${x(end.u)} y2=${y(end.v)} />`,
 			)}
-			${known.map(
-				({ u, v }) => html`<circle key=${`${u},${v}`} class="rim" cx=${x(u)} cy=${y(v)} r="4" />
-					<circle class="line depth-taped" cx=${x(u)} cy=${y(v)} r="4" />`,
-			)}
-			${marks.map(
-				({ u, v }, at) => html`<circle key=${at} class="rim" cx=${x(u)} cy=${y(v)} r="6" />
-					<circle class="line" cx=${x(u)} cy=${y(v)} r="6" />`,
-			)}
+			${known.map((one) => ring(one, 4, "line depth-taped"))} ${marks.map((one) => ring(one, 6, "line"))}
 			${reading &&
 			html`<g class="depth-cross">
 				<line class="rim" x1="0" y1=${y(reading.v)} x2="100%" y2=${y(reading.v)} />

@@ -1,7 +1,7 @@
 /** The view Status: whether the service can work, how busy it is, and how good its model is. */
 
 import { Problem, getBlob, getJson, getText, problemOf, storedKey } from "./api.js";
-import { ProblemBox } from "./problem_box.js";
+import { ProblemBox, useProblem } from "./problem_box.js";
 import { histogramOf, readSamples, valueOf } from "./prometheus.js";
 import { save } from "./save.js";
 import { Table } from "./table.js";
@@ -130,18 +130,16 @@ async function orProblem(asked) {
 
 /** @param {Found & {onRetry: () => void}} props */
 function Readiness({ ready, samples, at, onRetry }) {
-	const isGone = ready instanceof Problem && ready.status === 0;
+	const isFault = ready instanceof Problem;
+	const fault = ready?.status === 0 ? "No answer" : "Not ready";
+	const [tone, words] = ready === null ? ["", "Asking …"] : isFault ? ["bad", fault] : ["good", "Ready"];
 	return html`
 		<section class="card" aria-labelledby="ready-title">
 			<div class="row ends">
 				<h3 id="ready-title">Service</h3>
-				${ready === null
-					? html`<span class="badge">Asking …</span>`
-					: ready instanceof Problem
-						? html`<span class="badge bad">${isGone ? "No answer" : "Not ready"}</span>`
-						: html`<span class="badge good">Ready</span>`}
+				<span class=${`badge ${tone}`}>${words}</span>
 			</div>
-			${ready instanceof Problem
+			${isFault
 				? html`<${ProblemBox} problem=${ready} onRetry=${onRetry} />`
 				: ready !== null &&
 					html`<dl class="facts">
@@ -158,7 +156,7 @@ function Readiness({ ready, samples, at, onRetry }) {
 
 /** @param {{wantsKey: boolean}} props */
 function Documents({ wantsKey }) {
-	const [failed, setFailed] = useState(/** @type {Problem | null} */ (null));
+	const [failed, setFailed] = useProblem();
 	if (!wantsKey) {
 		return html`<p><a href="docs">API, to try out</a> · <a href="openapi.json">API as OpenAPI</a></p>`;
 	}
@@ -256,23 +254,16 @@ function Stages({ samples }) {
 	}));
 	const longestMs = Math.max(...stages.map(({ meanMs }) => meanMs));
 	return html`
-		<div class="table-scroll">
-			<table class="stages">
-				<caption>Mean time of each stage</caption>
-				<thead>
-					<tr><th scope="col">Stage</th><th scope="col" class="number">ms</th><td class="bars"></td></tr>
-				</thead>
-				<tbody>
-					${stages.map(
-						({ stage, meaning, meanMs }) => html`<tr key=${stage}>
-							<th scope="row">${meaning}</th>
-							<td class="number">${meanMs.toFixed(meanMs < 10 ? 1 : 0)}</td>
-							<td class="bars"><div style=${{ width: `${(100 * meanMs) / (longestMs || 1)}%` }}></div></td>
-						</tr>`,
-					)}
-				</tbody>
-			</table>
-		</div>
+		<h4>Mean time of each stage</h4>
+		<${Table} label="Mean time of each stage" head=${["Stage", "ms", ""]} numbers=${[1]}>
+			${stages.map(
+				({ stage, meaning, meanMs }) => html`<tr key=${stage}>
+					<th scope="row">${meaning}</th>
+					<td class="number">${meanMs.toFixed(meanMs < 10 ? 1 : 0)}</td>
+					<td class="bars"><div style=${{ width: `${(100 * meanMs) / (longestMs || 1)}%` }}></div></td>
+				</tr>`,
+			)}
+		<//>
 	`;
 }
 

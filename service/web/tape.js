@@ -61,7 +61,7 @@ export function Tape({ mark, known, onKnown }) {
 		${known.length > 0 &&
 		html`<ul class="depth-known">
 			${known.map(
-				(one) => html`<li key=${`${one.u},${one.v}`}>
+				(one) => html`<li class="row ends" key=${`${one.u},${one.v}`}>
 					<span>${metres(one.depthM)} at ${one.u}, ${one.v}</span>
 					<button
 						type="button"

@@ -1,12 +1,13 @@
-/** A line of text with its label, and under it what it is for or what is wrong with it. */
+/** Fields with their labels: a line of text, and under it what it is for or what is wrong with it; a choice. */
 
 import { html } from "./vendor/preact.js";
 
 /**
  * @param {{id: string, label: string, value: string, onInput: (value: string) => void, fault?: string, hint?: any,
- *   kind?: string, list?: string, disabled?: boolean, invalid?: boolean}} props
+ *   onChange?: (value: string) => void, kind?: string, list?: string, disabled?: boolean, invalid?: boolean}} props
+ *   `onChange` is for when the typing is over
  */
-export function TextField({ id, label, value, onInput, fault = "", hint, kind, list, disabled = false, invalid = fault !== "" }) {
+export function TextField({ id, label, value, onInput, fault = "", hint, onChange, kind, list, disabled = false, invalid = fault !== "" }) {
 	return html`
 		<div class="field">
 			<label for=${id}>${label}</label>
@@ -22,8 +23,19 @@ export function TextField({ id, label, value, onInput, fault = "", hint, kind, l
 				aria-invalid=${invalid}
 				aria-describedby=${`${id}-told`}
 				onInput=${(/** @type {any} */ event) => onInput(event.target.value)}
+				onChange=${(/** @type {any} */ event) => onChange?.(event.target.value)}
 			/>
 			<span id=${`${id}-told`} class=${fault ? "fault" : "hint"}>${fault || hint}</span>
 		</div>
 	`;
+}
+
+/** @param {{label: string, value: string, options: string[][], onChange: (value: string) => void}} props `options` are values and words */
+export function Choice({ label, value, options, onChange }) {
+	return html`<label class="field">
+		${label}
+		<select value=${value} onChange=${(/** @type {any} */ event) => onChange(event.target.value)}>
+			${options.map(([one, words]) => html`<option key=${one} value=${one}>${words}</option>`)}
+		</select>
+	</label>`;
 }

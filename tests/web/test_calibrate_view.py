@@ -9,7 +9,7 @@ from uuid import uuid4
 import cv2
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
 from model_export.served import Server, serving
 from tests.inference.photographs import tiff
@@ -146,6 +146,58 @@ def test_a_corner_is_named_as_the_photograph_is_held(page: Page, orientation: in
     page.goto("#calibrate")
     advice = page.evaluate("async (seen) => (await import('/web/guidance.js')).adviceFor(seen, 1)", seen)
     assert advice == f"Next: one with the sheet towards the {corner} corner."
+
+
+@pytest.mark.parametrize(
+    ("blurs", "advice"),
+    [
+        ([0.48, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.82], "Next: one clearly blurred"),
+        ([1.8, 1.9, 2.0, 2.1, 2.2, 2.3, 2.4, 2.5], "Next: one in which the sheet is sharper"),
+        ([0.5, 0.6, 0.7, 0.8, 1.2, 1.6, 1.8, 2.0], "This is a good set"),
+    ],
+)
+def test_a_set_is_good_where_blur_differs(page: Page, blurs: list[float], advice: str) -> None:
+    """Nothing tells the focal length; the sheet is large and small, and in every corner."""
+    seen = [
+        {
+            "role": "defocused",
+            "width": 600,
+            "height": 400,
+            "orientation": 1,
+            "circles": [{"u_px": 300 + x * size, "v_px": 200 + y * size} for x in (-290, 290) for y in (-190, 190)],
+            "blur": blur,
+            "distance": None,
+            "tilt": None,
+        }
+        for blur, size in zip(blurs, (1, 0.9, 0.8, 0.7, 0.6, 0.5, 0.6, 0.7), strict=True)
+    ]
+    page.goto("#calibrate")
+    told = page.evaluate("async (seen) => (await import('/web/guidance.js')).adviceFor(seen, null)", seen)
+    assert told.startswith(advice)
+
+
+def test_a_result_that_is_not_determined_is_no_success(page: Page, photographs: list[Path], name: str) -> None:
+    def widen(route: Route) -> None:
+        answer = route.fetch()
+        job = answer.json()
+        job["result"]["k_cam_px"] |= {"low": 1.0, "high": 4.0}
+        route.fulfill(response=answer, json=job)
+
+    def is_shown(is_wide: bool) -> None:
+        expect(page.get_by_role("heading", name=f"What was found for {name}")).to_be_visible(timeout=LONG_MS)
+        accept = page.get_by_role("button", name="Accept as a new camera")
+        expect(accept).to_have_class("" if is_wide else "primary")
+        for told in ("not determined well", "k_cam may be anything from 1 to 4 px", "Back to the photographs"):
+            expect(page.get_by_text(told)).to_have_count(int(is_wide))
+
+    to_photographs(page, name)
+    drop(page, *photographs[:3])
+    page.get_by_role("button", name="Start the calibration").click()
+    is_shown(is_wide=False)
+    page.route(re.compile(r"/calibrations/[^/?]+$"), widen)
+    page.reload()
+    page.get_by_role("button", name=f"Open the calibration of {name}").click()
+    is_shown(is_wide=True)
 
 
 def test_a_photograph_that_misses_its_place_does_not_replace_the_page(page: Page) -> None:

@@ -8,10 +8,10 @@ from typing import Any
 from uuid import uuid4
 
 import pytest
-from playwright.sync_api import Page, Route, expect
+from playwright.sync_api import Dialog, Page, Route, expect
 
 from model_export.served import Server
-from tests.web.steps import OVERFLOW
+from tests.web.steps import OVERFLOW, eventually
 
 JSON = {"Content-Type": "application/json"}
 LENS = {"Focal length (mm)": "35", "f-number": "2.8", "Pixel pitch (µm)": "6.05", "Sensor width (px)": "3872"}
@@ -98,7 +98,10 @@ def test_a_name_that_is_taken_is_told(
     page.get_by_label("k_cam", exact=True).check()
     fill(page, FRAME | {"Name": phone["name"], "k_cam (px)": "2"})
     page.get_by_role("button", name="Create camera").click()
-    expect(page.get_by_label("Name", exact=True)).to_have_accessible_description("This name is taken.")
+    expect(page.get_by_label("Name", exact=True)).to_have_accessible_description(
+        "This name is taken: open that camera to change it."
+    )
+    expect(page.get_by_role("alert")).not_to_contain_text(re.compile("PUT|#/"))
 
 
 @pytest.mark.parametrize("keeps_mine", [True, False])
@@ -174,6 +177,22 @@ def test_a_camera_is_deleted_after_a_question(page: Page, served: Server, phone:
     assert served.ask("GET", f"/cameras/{phone['name']}").status == 404
 
 
+def test_a_camera_that_was_changed_meanwhile_is_not_deleted_unseen(
+    page: Page, served: Server, phone: dict[str, Any], expected_errors: list[str]
+) -> None:
+    expected_errors.append("status of 412")
+    open_camera(page, served, phone)
+    served.ask("PUT", f"/cameras/{phone['name']}", json.dumps(phone | {"k_cam_px": 1.7}), JSON)
+    page.get_by_role("button", name="Delete", exact=True).click()
+    dialog = page.get_by_role("dialog", name=f"Delete {phone['name']}?")
+    dialog.get_by_role("button", name=f"Delete {phone['name']}").click()
+    expect(dialog.get_by_role("alert")).to_be_visible()
+    expect(dialog.get_by_role("button", name="Try again")).to_have_count(0)
+    dialog.get_by_role("button", name="See how it is now").click()
+    expect(dialog).to_be_hidden()
+    expect(page.get_by_text("revision 2", exact=True)).to_be_visible()
+
+
 def test_what_is_exported_comes_back_after_it_is_shown(
     page: Page,
     served: Server,
@@ -229,6 +248,17 @@ def test_a_photograph_fills_the_form_in(page: Page) -> None:
     expect(page.get_by_text("focus_distance_m is needed")).to_be_visible()
 
 
+def test_a_photograph_that_was_made_small_leaves_the_sensor_as_it_was_typed(page: Page) -> None:
+    page.goto("#cameras")
+    page.get_by_role("button", name="New camera").click()
+    fill(page, {"Sensor width (px)": "3872"})
+    page.get_by_label("Fill in from a photograph it took").set_input_files(
+        Path(__file__).parents[2] / "docs/pictures/coffee.jpg"
+    )
+    expect(page.get_by_label("Image width (px)")).to_have_value("645")
+    expect(page.get_by_label("Sensor width (px)")).to_have_value("3872")
+
+
 def test_a_photograph_takes_nothing_away_that_was_measured(page: Page, served: Server, phone: dict[str, Any]) -> None:
     open_camera(page, served, phone | {"gamma_px": 0.83, "intrinsics": LENS_OF_ITS_SIZE})
     page.get_by_role("button", name="Edit", exact=True).click()
@@ -251,6 +281,83 @@ def test_the_way_back_leaves_an_edit_as_it_is(page: Page, served: Server, phone:
     page.get_by_role("tab", name="Status").click()
     page.go_back()
     expect(page.get_by_label("Focus distance (m)")).to_have_value("1.23")
+
+
+def test_a_camera_that_is_opened_is_in_sight_and_in_the_address(
+    page: Page, served: Server, phone: dict[str, Any]
+) -> None:
+    names = [f"{phone['name']}-{number}" for number in range(12)]
+    for name in names:
+        assert served.add(phone | {"name": name}) == 201
+    page.set_viewport_size({"width": 390, "height": 844})
+    page.goto("#cameras")
+    for name in (names[0], names[3]):
+        page.get_by_role("button", name=name, exact=False).first.click()
+        title = page.get_by_role("heading", name=name, exact=True)
+        expect(title).to_be_in_viewport()
+        expect(title).to_be_focused()
+        assert page.url.endswith(f"#cameras/{name}")
+    # once more, after a look at the list
+    page.evaluate("scrollTo(0, 0)")
+    page.get_by_role("button", name=names[3]).click()
+    expect(page.get_by_role("heading", name=names[3], exact=True)).to_be_in_viewport()
+    page.reload()
+    expect(page.get_by_role("heading", name=names[3], exact=True)).to_be_visible()
+    page.go_back()
+    expect(page.get_by_role("heading", name=names[0], exact=True)).to_be_visible()
+    page.get_by_role("tab", name="Status").click()
+    page.get_by_role("tab", name="Cameras").click()
+    assert page.url.endswith(f"#cameras/{names[0]}")
+    page.go_back()
+    page.go_back()
+    page.go_back()
+    expect(page.get_by_text("Choose a camera to see what it can measure.")).to_be_visible()
+
+
+def test_what_is_typed_is_not_thrown_away_unasked(page: Page, served: Server, phone: dict[str, Any]) -> None:
+    other = f"{phone['name']}-other"
+    for name in (phone["name"], other):
+        assert served.add(phone | {"name": name}) == 201
+    page.goto(f"#cameras/{phone['name']}")
+    page.get_by_role("button", name="Edit", exact=True).click()
+    focus = page.get_by_label("Focus distance (m)")
+    focus.fill("1,23")
+    asked: list[str] = []
+
+    def decline(dialog: Dialog) -> None:
+        asked.append(dialog.message)
+        dialog.dismiss()
+
+    page.once("dialog", decline)
+    page.get_by_role("button", name=other).click()
+    eventually(page, lambda: asked == ["Throw away what you have typed?"] and page.url.endswith(f"/{phone['name']}"))
+    expect(focus).to_have_value("1,23")
+    page.once("dialog", lambda dialog: dialog.accept())
+    page.get_by_role("button", name=other).click()
+    expect(page.get_by_role("heading", name=other, exact=True)).to_be_visible()
+    # nothing is typed, nothing is asked
+    page.get_by_role("button", name="Edit", exact=True).click()
+    page.get_by_role("button", name=phone["name"]).first.click()
+    expect(page.get_by_role("heading", name=phone["name"], exact=True)).to_be_visible()
+
+
+def test_a_range_ends_where_answers_end(page: Page, served: Server, phone: dict[str, Any]) -> None:
+    nearest, farthest = served.ask("GET", "/model").json()["manifest"]["ranges"]["depth_ratio"]
+    strong = phone | {"name": f"{phone['name']}-strong", "k_cam_px": 300.0, "focus_distance_m": 2.0}
+    weak = phone | {"name": f"{phone['name']}-weak", "k_cam_px": 0.05, "focus_distance_m": 2.0}
+    for camera in (strong, weak):
+        assert served.add(camera) == 201
+    assert read(served, strong["name"])["range_m"]["far"] > farthest * 2
+    for camera, words in ((strong, f"{nearest * 2:g} to {farthest * 2:g} m"), (weak, "none")):
+        page.goto(f"#cameras/{camera['name']}")
+        expect(page.get_by_role("heading", name=camera["name"])).to_be_visible()
+        expect(page.locator(".figures div").filter(has_text="Usable range").get_by_role("definition")).to_have_text(
+            words
+        )
+    page.goto(f"#depth/{strong['name']}")
+    expect(page.get_by_text(f"reads {nearest * 2:g} to {farthest * 2:g} m well")).to_be_visible()
+    page.goto(f"#depth/{weak['name']}")
+    expect(page.get_by_text("reads no depth well")).to_be_visible()
 
 
 def test_cameras_fit_a_phone_and_the_dark(

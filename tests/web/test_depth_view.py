@@ -3,6 +3,7 @@
 import base64
 import io
 import json
+import re
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -15,7 +16,7 @@ import matplotlib
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from playwright.sync_api import Browser, Locator, Page, Position, expect
+from playwright.sync_api import Browser, Locator, Page, Position, Route, expect
 
 from model_export.served import Server, serving
 from tests.inference import photographs
@@ -258,6 +259,10 @@ def test_colours_are_those_of_the_metres(measured: Page, maps: Callable[..., Any
 
     eventually(measured, is_painted)
     expect(measured.locator(".depth-ticks")).to_contain_text("2")
+    far = measured.get_by_label("Far end of the colours, metres")
+    far.fill("3,25")
+    far.press("Enter")
+    expect(far).to_have_value("3.250")
 
 
 def test_colour_maps_are_those_that_others_draw(opened: Page) -> None:
@@ -285,10 +290,10 @@ def test_the_divider_uncovers_the_photograph(measured: Page) -> None:
 
 def test_another_side_or_focus_is_read_again(measured: Page, maps: Callable[..., Any]) -> None:
     side = measured.get_by_role("combobox", name="Side of the plane in focus")
-    focus = measured.get_by_role("spinbutton", name="Focus distance of this shot")
+    focus = measured.get_by_label("Focus distance of this shot")
 
     def refocus() -> None:
-        focus.fill("1.5")
+        focus.fill("1,5")
         focus.press("Enter")
 
     def change_side() -> None:
@@ -459,6 +464,7 @@ def test_a_photograph_that_is_no_frame_of_the_camera_drafts_its_own(
     give(opened, square)
     expect(opened.get_by_role("alert")).to_contain_text("320x320 pixels upright, the camera 645x432")
     expect(opened.get_by_role("combobox", name="Camera", exact=True)).to_have_attribute("aria-invalid", "true")
+    expect(opened.get_by_text("From a crop every depth would be wrong.")).to_be_visible()
     opened.get_by_role("button", name="Draft a camera").click()
     form = opened.get_by_role("form", name="A camera from this photograph")
     expect(form).to_contain_text("focus_distance_m is needed")
@@ -468,12 +474,78 @@ def test_a_photograph_that_is_no_frame_of_the_camera_drafts_its_own(
         ("Real focal length", "35"),
         ("f-number", "2.8"),
         ("Pixel pitch", "36"),
+        ("Sensor width", "320"),
     ):
         form.get_by_label(label).fill(value)
     form.get_by_role("button", name="Store the camera").click()
     stage(opened)
     assert served.ask("GET", "/cameras/squared").json()["lens"]["focal_length_mm"] == 35
     expect(opened.get_by_role("combobox", name="Camera", exact=True)).to_have_value("squared")
+
+
+def test_a_draft_asks_for_the_sensor_and_takes_commas(opened: Page, served: Server) -> None:
+    def forget_sensor(route: Route) -> None:
+        draft = route.fetch().json()
+        draft["lens"]["sensor_width_px"] = None
+        route.fulfill(json=draft)
+
+    opened.route("**/cameras/from-photo", forget_sensor)
+    give(opened)
+    form = opened.get_by_role("form", name="A camera from this photograph")
+    store = form.get_by_role("button", name="Store the camera")
+    fields = {
+        "Name": "d200",
+        "Focus distance": "2,0",
+        "Real focal length": "35",
+        "f-number": "2,8",
+        "Pixel pitch": "6,05",
+    }
+    for label, value in fields.items():
+        form.get_by_label(label).fill(value)
+    sensor = form.get_by_label("Sensor width (px)")
+    expect(sensor).to_have_value("")
+    expect(sensor).to_have_accessible_description("pixels across the full-size photograph the camera takes")
+    expect(form).to_contain_text("Fill in sensor width first.")
+    expect(store).to_be_disabled()
+    sensor.fill("wide")
+    expect(sensor).to_have_accessible_description("This is no number.")
+    expect(store).to_be_disabled()
+    sensor.fill("3872")
+    form.get_by_label("Name").fill("messenger")
+    store.click()
+    stage(opened)
+    lens = served.ask("GET", "/cameras/messenger").json()["lens"]
+    assert (lens["f_number"], lens["pixel_pitch_um"], lens["sensor_width_px"]) == (2.8, 6.05, 3872)
+
+
+def test_the_focus_of_one_shot_is_no_other_s(opened: Page, served: Server, d200: dict[str, Any]) -> None:
+    served.add({**d200, "name": "other"})
+    opened.reload()
+    focus = opened.get_by_label("Focus distance of this shot")
+    choose(opened)
+    focus.fill("far")
+    expect(focus).to_have_accessible_description("This is no distance in metres.")
+    give(opened)
+    for act in (lambda: choose(opened, "other"), lambda: give(opened)):
+        focus.fill("1,8")
+        with opened.expect_request(lambda request: "focus_distance_m=1.8" in request.url):
+            focus.press("Enter")
+        with opened.expect_request(lambda request: "/depth?" in request.url) as asked:
+            act()
+        assert "focus_distance_m" not in asked.value.url
+        expect(focus).to_have_value("")
+    served.ask("DELETE", "/cameras/other")
+
+
+def test_the_camera_stays_in_the_address(opened: Page) -> None:
+    choose(opened)
+    assert opened.url.endswith("#depth/d200")
+    opened.reload()
+    expect(opened.get_by_role("combobox", name="Camera", exact=True)).to_have_value("d200")
+    opened.get_by_role("tab", name="Status").click()
+    opened.go_back()
+    assert opened.url.endswith("#depth/d200")
+    expect(opened.get_by_role("combobox", name="Camera", exact=True)).to_have_value("d200")
 
 
 def test_without_a_camera_the_photograph_is_asked_for_one(opened: Page, barriers: Callable[[Page], list[str]]) -> None:
@@ -504,6 +576,50 @@ def test_a_full_service_says_when_and_a_cancelled_photograph_makes_room(
         second.get_by_role("button", name="Try again").click()
         stage(second)
         expect(second.get_by_role("alert")).to_have_count(0)
+
+
+def test_a_photograph_of_too_many_pixels_is_told_the_size_that_would_do(
+    browser: Browser, tmp_path: Path, tiny_model_dir: Path, d200: dict[str, Any]
+) -> None:
+    few = {"CAMIND_MAX_IMAGE_PIXELS": "100000"}
+    with (
+        serving(tmp_path / "data", "--model", tiny_model_dir, settings=few) as server,
+        watched(browser, server.url, [REFUSED]) as page,
+    ):
+        server.add(d200)
+        page.goto("")
+        choose(page)
+        give(page)
+        problem = page.get_by_role("alert")
+        expect(problem).to_contain_text("Make it 386x258 or smaller: the camera need not change.")
+        expect(problem.get_by_role("button", name="Dismiss")).to_be_visible()
+        expect(problem.get_by_role("button", name="Try again")).to_have_count(0)
+        pixels = cv2.imread(str(PHOTOGRAPH))
+        assert pixels is not None
+        give(page, cv2.imencode(".jpg", cv2.resize(pixels, (386, 258)))[1].tobytes())
+        stage(page)
+
+
+def test_one_tries_again_where_that_may_help(opened: Page) -> None:
+    helps = opened.evaluate(
+        """async (statuses) => {
+          const { Problem } = await import("./web/api.js");
+          return statuses.filter((status) => new Problem({ status, title: "", detail: "" }).isPassing);
+        }""",
+        [0, 400, 404, 408, 409, 413, 415, 422, 429, 500, 503],
+    )
+    assert helps == [0, 408, 429, 500, 503]
+
+
+def test_an_answer_that_comes_slowly_is_said_to_come(opened: Page) -> None:
+    network = opened.context.new_cdp_session(opened)
+    slow = {"offline": False, "latency": 0, "uploadThroughput": -1, "downloadThroughput": 2_000_000}
+    network.send("Network.emulateNetworkConditions", slow)
+    choose(opened)
+    give(opened)
+    expect(opened.get_by_text(re.compile(r"^Receiving the answer \d+ %$"))).to_be_visible()
+    expect(opened.get_by_role("progressbar", name="Progress")).to_have_attribute("value", re.compile(r"0\.\d"))
+    stage(opened)
 
 
 def test_a_photograph_that_browsers_do_not_show_is_read_all_the_same(opened: Page) -> None:
