@@ -210,6 +210,7 @@ def accept_calibration(record: FoundDep, calibrations: CalibrationsDep, body: Ac
     "/calibrations/{id}",
     operation_id="cancelCalibration",
     status_code=204,
+    response_class=Response,
     summary="Cancel a calibration",
     responses=responses(NotFound, *WRITE_ERRORS),
 )

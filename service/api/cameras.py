@@ -53,6 +53,7 @@ router = APIRouter(prefix="/cameras", tags=["cameras"])
 IfMatch = Annotated[
     str | None, Header(description="ETag of the revision that is to be changed; another one answers 412")
 ]
+IfNoneMatch = Annotated[str | None, Header(description="ETag of a revision that is at hand; the same answers 304")]
 Depth = Annotated[float | None, Query(ge=0.001, le=100_000, allow_inf_nan=False, description="Metres")]
 
 
@@ -127,11 +128,22 @@ def preview_camera(body: CameraReplace) -> PreviewRead:
     "/{name}",
     operation_id="readCamera",
     summary="Read a camera",
-    responses={200: {"headers": ETAG}, **responses(NotFound, *STORE_ERRORS)},
+    response_model=CameraRead,
+    responses={
+        200: {"headers": ETAG},
+        304: {"description": "The revision of If-None-Match is the current one", "headers": ETAG},
+        **responses(NotFound, *STORE_ERRORS),
+    },
 )
-def read_camera(name: str, cameras: CamerasDep, response: Response) -> CameraRead:
+def read_camera(
+    name: str, cameras: CamerasDep, response: Response, if_none_match: IfNoneMatch = None
+) -> CameraRead | Response:
     """The camera at its current revision."""
-    return _answer(cameras.get(name), response)
+    record = cameras.get(name)
+    answer = _answer(record, response)
+    if _is_at_hand(record.revision, if_none_match):
+        return Response(status_code=304, headers={"ETag": response.headers["ETag"]})
+    return answer
 
 
 @router.put(
@@ -156,6 +168,7 @@ def replace_camera(
     "/{name}",
     operation_id="deleteCamera",
     status_code=204,
+    response_class=Response,
     summary="Delete a camera",
     responses=responses(NotFound, PreconditionFailed, *WRITE_ERRORS),
 )
@@ -229,6 +242,12 @@ def _revisions(if_match: str | None) -> list[int] | None:
     if if_match is None or if_match.strip() == "*":
         return None
     return [int(number) for number in re.findall(r'(?<!W/)"(\d{1,9})"', if_match)]
+
+
+def _is_at_hand(revision: int, if_none_match: str | None) -> bool:
+    """Whether If-None-Match has the revision; here a weak tag is as good (RFC 9110)."""
+    tags = [tag.strip().removeprefix("W/") for tag in (if_none_match or "").split(",")]
+    return "*" in tags or f'"{revision}"' in tags
 
 
 def _curve(camera: Camera, near_m: float, far_m: float, points: int) -> list[CurvePoint]:

@@ -231,6 +231,7 @@ def test_a_waiting_one_can_be_cancelled(client: TestClient, fake: FakeCalibratio
     assert fake.has_begun.wait(PATIENCE_S)
     answer = client.delete(waiting)
     assert (answer.status_code, answer.content) == (204, b"")
+    assert "content-type" not in answer.headers
     assert client.get(waiting).json()["state"] == "cancelled"
     assert folders(spool_dir) == [running.rpartition("/")[2]]
     fake.go.set()

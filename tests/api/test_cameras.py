@@ -368,3 +368,28 @@ def test_revisions_of_nothing_and_cursors_of_nobody_are_refused(client: TestClie
     assert client.get("/cameras/pixel7-wide/revisions").status_code == 404
     client.post("/cameras", json=phone)
     assert client.get("/cameras/pixel7-wide/revisions", params={"cursor": cursor_after("pixel7")}).status_code == 422
+
+
+@pytest.mark.parametrize(
+    ("tag", "status"),
+    [('"1"', 304), ('W/"1"', 304), ('"7", "1"', 304), ("*", 304), ('"2"', 200), ("1", 200), ("", 200), ('"11"', 200)],
+)
+def test_a_revision_that_is_at_hand_is_not_sent_again(
+    client: TestClient, phone: dict[str, Any], tag: str, status: int
+) -> None:
+    path = client.post("/cameras", json=phone).headers["location"]
+    answer = client.get(path, headers={"If-None-Match": tag})
+    assert (answer.status_code, answer.headers["etag"]) == (status, '"1"')
+    if status == 304:
+        assert answer.content == b""
+        assert "content-type" not in answer.headers
+    client.put(path, json=phone)
+    assert client.get(path, headers={"If-None-Match": '"1"'}).json()["revision"] == 2
+    assert client.get("/cameras/nobody", headers={"If-None-Match": "*"}).status_code == 404
+
+
+def test_no_content_has_no_type(client: TestClient, phone: dict[str, Any]) -> None:
+    client.post("/cameras", json=phone)
+    answer = client.delete(f"/cameras/{phone['name']}")
+    assert (answer.status_code, answer.content) == (204, b"")
+    assert "content-type" not in answer.headers
