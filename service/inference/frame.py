@@ -1,8 +1,11 @@
 """Whether a photograph is a camera's frame, and the camera as that photograph has it."""
 
+from dataclasses import replace
+
 from service.errors import ImageSizeMismatch
 from service.inference.headers import Shot
 from service.inference.images import TURNS, Photograph
+from service.optics import thin_lens
 from service.optics.camera import Camera, Lens
 
 LENS_TOLERANCE = 0.05
@@ -55,6 +58,9 @@ def other_lens(shot: Shot, lens: Lens) -> tuple[str, ...]:
 
 
 def _at_size(camera: Camera, width_px: int, height_px: int) -> Camera:
-    """The camera behind its frame at another size: pixels of a smaller one average those they were made of."""
-    resize = camera.averaged if width_px < camera.image_width_px else camera.resized
-    return resize(width_px, height_px)
+    """The camera behind its frame at another size, in which a smaller one's pixels are as wide as any others."""
+    resized = camera.resized(width_px, height_px)
+    if width_px >= camera.image_width_px:
+        return resized
+    gamma_px = thin_lens.gamma_after_shrinking(camera.gamma_px, width_px / camera.image_width_px)
+    return replace(resized, gamma_px=gamma_px)

@@ -90,6 +90,15 @@ def gamma_after_averaging(gamma_px: float, from_px: int, to_px: int) -> float:
     return math.sqrt(rest + averaging_variance(from_px, to_px) + PIXEL_BOX_VARIANCE)
 
 
+def gamma_after_shrinking(gamma_px: float, ratio: float) -> float:
+    """gamma in pixels of a copy ``ratio`` (up to 1) of the size, made small by a filter that is not known.
+
+    It has a pixel's box again, as far as gamma had it, and the rest of it scales: what any good filter leaves.
+    """
+    box = min(PIXEL_BOX_VARIANCE, gamma_px**2)
+    return math.sqrt((gamma_px**2 - box) * ratio**2 + box)
+
+
 def gamma_before_averaging(gamma_px: float, from_px: int, to_px: int) -> float:
     """gamma of the picture whose copy has ``gamma_px``; that of a pixel's box alone where none is so sharp."""
     rest = gamma_px**2 - averaging_variance(from_px, to_px) - PIXEL_BOX_VARIANCE

@@ -66,7 +66,7 @@ def test_a_camera_registered_by_its_upright_size_takes_it_too() -> None:
 def test_a_resized_frame_scales_the_blur_constants_and_says_so(orientation: int) -> None:
     camera, warnings = camera_of(photograph(320, 240, orientation), CAMERA)
     assert camera.k_cam_px == pytest.approx(3.0)
-    assert camera.gamma_px == pytest.approx(thin_lens.gamma_after_averaging(0.5, 640, 320))
+    assert camera.gamma_px == pytest.approx(thin_lens.gamma_after_shrinking(0.5, 0.5))
     assert camera.gamma_px**2 > thin_lens.PIXEL_BOX_VARIANCE > 0.25**2
     assert "k_cam_px 3" in warnings[0]
     assert f"gamma_px {camera.gamma_px:.4g}" in warnings[0]

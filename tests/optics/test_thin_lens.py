@@ -178,3 +178,11 @@ def test_an_edge_is_as_steep_after_sharpening_as_one_of_the_blur_asked_for(blur_
     sharpened = (1 + amount) * edge(before_px) - amount * edge(math.hypot(before_px, spread_px))
     assert np.gradient(sharpened, x).max() == pytest.approx(np.gradient(edge(blur_px), x).max(), rel=1e-3)
     assert thin_lens.blur_before_sharpening(blur_px, 0.0, spread_px) == pytest.approx(blur_px)
+
+
+@given(gamma_px=st.floats(0, 3), ratio=st.floats(0.01, 1))
+def test_gamma_of_a_smaller_picture_is_between_its_scaled_self_and_itself(gamma_px: float, ratio: float) -> None:
+    small = thin_lens.gamma_after_shrinking(gamma_px, ratio)
+    assert gamma_px * ratio - 1e-9 <= small <= gamma_px + 1e-9
+    assert small >= min(gamma_px, thin_lens.PIXEL_BOX_VARIANCE**0.5) - 1e-9
+    assert thin_lens.gamma_after_shrinking(gamma_px, 1) == pytest.approx(gamma_px)

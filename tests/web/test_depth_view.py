@@ -526,7 +526,8 @@ def test_the_focus_of_one_shot_is_no_other_s(opened: Page, served: Server, d200:
     focus.fill("far")
     expect(focus).to_have_accessible_description("This is no distance in metres.")
     give(opened)
-    for act in (lambda: choose(opened, "other"), lambda: give(opened)):
+    acts: tuple[Callable[[], None], ...] = (lambda: choose(opened, "other"), lambda: give(opened))
+    for act in acts:
         focus.fill("1,8")
         with opened.expect_request(lambda request: "focus_distance_m=1.8" in request.url):
             focus.press("Enter")
