@@ -29,6 +29,7 @@ LEAST_CIRCULARITY = 0.6
 LEAST_CONVEXITY = 0.85
 LEAST_INERTIA = 0.15
 NEIGHBOURS = 8
+NESTED = 3  # blobs in one place, of which one may be a circle and another the outline of the sheet about it
 SEEDS = 40
 MOST_TRIES = 16  # at laying a lattice, each from another seed or along other axes
 MOST_GROWN = 4  # times the circles wanted: a lattice that goes on is not the pattern
@@ -197,15 +198,31 @@ def _seen_at(threshold: float, grey: NDArray[np.uint8]) -> Array:
 
 
 def _continued(found: Array, last: Array) -> NDArray[np.intp]:
-    """The number of each blob [n,3]: the one it had in ``last`` where it goes on, else the next one that is free."""
+    """The number of each blob [n,3]: the one it had in ``last`` where it goes on, else the next one that is free.
+
+    One of another size is another one: the sheet's outline about the circle in its middle.
+    """
     numbers = np.full(len(found), -1, np.intp)
     if len(last) and len(found):
-        away, nearest = cKDTree(last[:, :2]).query(found[:, :2])
-        radius = np.maximum(found[:, 2], last[nearest, 2]) / 2
-        numbers = np.where(away < np.maximum(radius, LEAST_APART_PX), nearest, numbers)
+        away, near = _nearest(cKDTree(last[:, :2]), found[:, :2])
+        size, before = found[:, 2, None], last[near, 2]
+        goes_on = away < np.maximum(np.maximum(size, before) / 2, LEAST_APART_PX)
+        goes_on &= _is_alike(size / before)
+        numbers = np.where(goes_on.any(1), near[np.arange(len(near)), goes_on.argmax(1)], numbers)
     is_new = numbers < 0
     numbers[is_new] = len(last) + np.arange(is_new.sum())
     return numbers
+
+
+def _nearest(tree: cKDTree, places: Array) -> tuple[Array, NDArray[np.intp]]:
+    """How far the few blobs nearest to a place [..., 2] are, and which, the nearest first [..., few]."""
+    away, near = tree.query(places, np.arange(1, min(NESTED, tree.n) + 1))
+    return np.asarray(away, np.float64), np.asarray(near, np.intp)
+
+
+def _is_alike(ratio: Array) -> NDArray[np.bool_]:
+    """Whether sizes of which these are the ratios may be those of one circle, or of two that are neighbours."""
+    return (ratio < LIKE_SIZE) & (ratio > 1 / LIKE_SIZE)
 
 
 def _seeds(blobs: _Blobs) -> Iterator[tuple[int, Array, Array]]:
@@ -217,7 +234,7 @@ def _seeds(blobs: _Blobs) -> Iterator[tuple[int, Array, Array]]:
     for first in np.argsort(evenness + 2 * alike)[:SEEDS]:
         steps = blobs.places[others[first, 1:]] - blobs.places[first]
         sizes = blobs.sizes[others[first, 1:]] / blobs.sizes[first]
-        steps = steps[(sizes < LIKE_SIZE) & (sizes > 1 / LIKE_SIZE)]
+        steps = steps[_is_alike(sizes)]
         for i in range(min(4, len(steps))):
             for j in range(i + 1, min(5, len(steps))):
                 u, v = steps[i], steps[j]
@@ -243,12 +260,13 @@ def _grown(blobs: _Blobs, first: int, u: Array, v: Array, most: int) -> dict[Cel
             if beside in cells:
                 continue
             step = sign * basis[axis]
-            away, found = blobs.tree.query(here + step)
-            size = blobs.sizes[found] / blobs.sizes[cells[cell]]
-            if found in taken or away > REACH * np.linalg.norm(step) or not 1 / LIKE_SIZE < size < LIKE_SIZE:
+            away, near = _nearest(blobs.tree, here + step)
+            is_next = (away < REACH * np.linalg.norm(step)) & _is_alike(blobs.sizes[near] / blobs.sizes[cells[cell]])
+            found = next((int(blob) for blob in near[is_next] if int(blob) not in taken), None)
+            if found is None:
                 continue
-            cells[beside] = int(found)
-            taken.add(int(found))
+            cells[beside] = found
+            taken.add(found)
             bases[beside] = _basis(cells, blobs, beside, basis)
             edge.append(beside)
     return cells
@@ -288,22 +306,32 @@ def _laid(cells: dict[Cell, int], blobs: _Blobs, wanted: list[Cell], grid: Circl
     if most < LEAST_FOUND * len(wanted) or len(cells) - most > spare:
         return None
     options = []
+    covered = set()
     for turn, shift, hits in ways:
         if hits == most:
-            chosen = [cells.get(_moved(cell, turn, shift)) for cell in wanted]
+            moved = [_moved(cell, turn, shift) for cell in wanted]
+            covered.add(frozenset(moved))
+            chosen = [cells.get(cell) for cell in moved]
             seen = np.array([blob is not None for blob in chosen])
             places = np.array([blobs.places[blob] if blob is not None else (np.nan, np.nan) for blob in chosen])
             options.append((places, seen))
-    if most < len(wanted) and len({tuple(seen) for _, seen in options}) > 1:
-        return None  # an outer row may be missing on either side
+    if most < len(wanted) and len(covered) > 1:
+        return None  # what is missing may be so on either side
     fronts = [option for option in options if _is_from_front(grid, *option)]
     if not fronts:
         return None
     places, seen = min(fronts, key=lambda option: _turn_to_upright(grid, *option))
+    if not _shows_all_sides(seen.reshape(grid.rows, grid.columns)):
+        return None
     if not seen.all():
         matrix, _ = cv2.findHomography(grid.points_mm()[seen], places[seen], 0)
         places[~seen] = projected(np.asarray(matrix), grid.points_mm()[~seen])
     return FoundGrid(places, np.zeros(len(places)), seen)
+
+
+def _shows_all_sides(seen: NDArray[np.bool_]) -> bool:
+    """Whether something of all four outer rows and columns is seen [rows, columns]: else the sheet may have fewer."""
+    return all(side.any() for side in (seen[0], seen[-1], seen[:, 0], seen[:, -1]))
 
 
 def _moved(cell: Cell, turn: int, shift: Cell) -> Cell:

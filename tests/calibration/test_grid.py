@@ -1,6 +1,7 @@
 """The grid found: in the sample photographs drawn here, sharp, blurred, turned, cropped and misnamed."""
 
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -76,6 +77,49 @@ def test_a_hidden_circle_is_filled_in_and_said_so() -> None:
     found = find_grid(picture, TALL)
     assert np.flatnonzero(~found.seen).tolist() == [21]
     assert np.abs(found.centres_px[21] - centres(TALL, matrix)[21]).max() < 1.0
+
+
+def test_the_outline_of_a_white_sheet_is_not_the_circle_in_its_middle() -> None:
+    matrix = view(SQUARE, px_per_mm=1.2)
+    low, high = (place.astype(int) for place in (centres(SQUARE, matrix)[0] - 20, centres(SQUARE, matrix)[-1] + 20))
+    table = np.full((HIGH, WIDE), 60, np.uint8)
+    sheet = np.s_[low[1] : high[1], low[0] : high[0]]
+    table[sheet] = drawn(SQUARE, matrix)[sheet]
+    found = find_grid(table, SQUARE)
+    assert found.seen.all()
+    assert np.abs(found.centres_px - centres(SQUARE, matrix)).max() < 1.0
+
+
+SAME_UPSIDE_DOWN = (
+    CircleGrid("symmetric_circles", 7, 10, 20.0, 12.0),
+    CircleGrid("symmetric_circles", 6, 6, 20.0, 12.0),
+    CircleGrid("asymmetric_circles", 10, 4, 20.0, 14.0),
+)
+
+
+def without(grid: CircleGrid, matrix: NDArray[np.float64], hidden: Sequence[int]) -> NDArray[np.uint8]:
+    """The grid drawn, some of its circles under white paper."""
+    picture = drawn(grid, matrix)
+    for x, y in centres(grid, matrix)[list(hidden)].astype(int).tolist():
+        cv2.rectangle(picture, (x - 18, y - 18), (x + 18, y + 18), 225, -1)
+    return picture
+
+
+@pytest.mark.parametrize("hidden", [(0,), (15,), (3, 8, 14, 15, 21, 27, 29)], ids=len)
+@pytest.mark.parametrize("grid", SAME_UPSIDE_DOWN, ids=lambda grid: f"{grid.kind}-{grid.rows}x{grid.columns}")
+def test_what_is_hidden_is_filled_in_where_a_sheet_looks_the_same_upside_down(
+    grid: CircleGrid, hidden: tuple[int, ...]
+) -> None:
+    matrix = view(grid, turn_deg=8)
+    found = find_grid(without(grid, matrix, hidden), grid)
+    assert np.flatnonzero(~found.seen).tolist() == list(hidden)
+    assert np.abs(found.centres_px - centres(grid, matrix)).max() < 1.0
+
+
+def test_an_outer_row_that_is_hidden_may_be_that_of_either_side() -> None:
+    grid = SAME_UPSIDE_DOWN[0]
+    with pytest.raises(GridError, match="60 of the grid's 70 circles"):
+        find_grid(without(grid, view(grid), range(60, 70)), grid)
 
 
 @pytest.mark.parametrize(
