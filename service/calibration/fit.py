@@ -172,6 +172,18 @@ def _otherwise(given_m: float, own: Interval | None) -> str | None:
     return told
 
 
+def odd_pictures(circles: Circles, constants: Constants) -> list[int]:
+    """The pictures of which most circles are outliers, and as far off as no curve may be."""
+    found = np.array([constants.k_cam_px.value, constants.gamma_px.value, constants.focus_distance_m.value])
+    off = np.abs(_model(found, circles) / circles.blur_px - 1)
+    return [
+        int(picture)
+        for picture in np.unique(circles.picture)
+        if constants.is_outlier[circles.picture == picture].mean() > 1 / 2
+        and float(np.median(off[circles.picture == picture])) > MISFIT
+    ]
+
+
 def fit_as_paper(
     circles: Circles,
     focus_distance_m: float,

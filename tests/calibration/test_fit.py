@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.calibration.fit import Circles, FitError, fit_constants
+from service.calibration.fit import Circles, FitError, fit_constants, odd_pictures
 from service.optics import thin_lens
 
 K_CAM, GAMMA, FOCUS = 6.0, 0.7, 1.2
@@ -57,6 +57,16 @@ def test_a_few_wrong_circles_are_shown_and_move_little() -> None:
     assert found.k_cam_px.value == pytest.approx(K_CAM, rel=0.05)
     assert found.is_outlier[::25].mean() > 0.8
     assert np.delete(found.is_outlier, np.s_[::25]).mean() < 0.05
+
+
+def test_a_picture_that_is_odd_is_told_from_pictures_with_some_wrong_circles() -> None:
+    some = circles(BOTH_SIDES)
+    blur = some.blur_px.copy()
+    blur[some.picture == 3] = np.hypot(blur[some.picture == 3], 2.0)
+    blur[::25] *= 2.5
+    wrong = replace(some, blur_px=blur)
+    assert odd_pictures(wrong, fit_constants(wrong, resamples=0)) == [3]
+    assert odd_pictures(some, fit_constants(some, resamples=0)) == []
 
 
 def test_one_side_is_said_and_stated_wide() -> None:
