@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from service.calibration.target import CircleGrid
+from service.calibration.target import LEAST_GAP_MM, CircleGrid, Kind
 from service.opencv import cv2
 
 COARSEST_PX = 640
@@ -154,7 +154,7 @@ def _find(grey: NDArray[np.uint8], grid: CircleGrid, check: Callable[[], None]) 
                 return found
             if tries == MOST_TRIES:
                 break
-    raise GridError(_why(best, blobs, wanted, grey.shape))
+    raise GridError(_why(best, blobs, wanted, grid, grey.shape))
 
 
 def _blobs(grey: NDArray[np.uint8], check: Callable[[], None]) -> _Blobs:
@@ -330,8 +330,11 @@ def _laid(cells: dict[Cell, int], blobs: _Blobs, wanted: list[Cell], grid: Circl
 
 
 def _shows_all_sides(seen: NDArray[np.bool_]) -> bool:
-    """Whether something of all four outer rows and columns is seen [rows, columns]: else the sheet may have fewer."""
-    return all(side.any() for side in (seen[0], seen[-1], seen[:, 0], seen[:, -1]))
+    """Whether all four outer rows and columns are there [rows, columns]: else the sheet may have fewer.
+
+    A single circle of one is not enough, for it may be something that lies beside the sheet.
+    """
+    return all(side.sum() >= min(2, side.size - 1) for side in (seen[0], seen[-1], seen[:, 0], seen[:, -1]))
 
 
 def _moved(cell: Cell, turn: int, shift: Cell) -> Cell:
@@ -374,10 +377,10 @@ def _turn_to_upright(grid: CircleGrid, places: Array, seen: NDArray[np.bool_]) -
     return abs(math.atan2(right[1], right[0]))
 
 
-def _why(cells: dict[Cell, int], blobs: _Blobs, wanted: list[Cell], shape: tuple[int, ...]) -> str:
+def _why(cells: dict[Cell, int], blobs: _Blobs, wanted: list[Cell], grid: CircleGrid, shape: tuple[int, ...]) -> str:
     """What the largest lattice that was seen has of the pattern, in words."""
     if len(cells) < max(6, 0.3 * len(wanted)):
-        return "no grid of dark circles was found"
+        return NOTHING
     places = blobs.places[list(cells.values())]
     step = float(np.median(np.asarray(blobs.tree.query(places, 2)[0])[:, 1]))
     low, high = places.min(0), places.max(0)
@@ -388,9 +391,43 @@ def _why(cells: dict[Cell, int], blobs: _Blobs, wanted: list[Cell], shape: tuple
             "rows and columns"
         )
     if len(cells) < len(wanted):
-        return f"only {len(cells)} of the grid's {len(wanted)} circles were seen; the rest is hidden or too faint"
-    at_least = "at least " if len(cells) >= MOST_GROWN * len(wanted) else ""
-    return (
-        f"a grid of {at_least}{len(cells)} circles was seen that is not the pattern given ({len(wanted)} circles): "
-        "check kind, rows and columns, and that the picture is not mirrored"
-    )
+        return (
+            f"only {len(cells)} of the grid's {len(wanted)} circles were seen; the rest is hidden or too faint, or the "
+            f"sheet has other rows and columns{_likeness(cells, blobs, grid)}"
+        )
+    if len(cells) >= MOST_GROWN * len(wanted):
+        seen = f"at least {len(cells)} circles was seen that is not the pattern given ({len(wanted)} circles)"
+    else:
+        likeness = _likeness(cells, blobs, grid)
+        seen = f"{len(cells)} circles was seen that is not the pattern given ({len(wanted)} circles){likeness}"
+    return f"a grid of {seen}: check kind, rows and columns, and that the picture is not mirrored"
+
+
+def _likeness(cells: dict[Cell, int], blobs: _Blobs, grid: CircleGrid) -> str:
+    """Which pattern the lattice looks like instead, the one most like the one given, to be said after it."""
+    a, b = np.array(list(cells)).T
+    across, along, rising, falling = (_extent(places) for places in (a, b, a + b, a - b))
+    sizes: list[tuple[Kind, int, int]] = [
+        ("symmetric_circles", across, along),
+        ("symmetric_circles", along, across),
+        ("asymmetric_circles", rising, falling // 2),
+        ("asymmetric_circles", falling, rising // 2),
+    ]
+    given = (grid.kind, grid.rows, grid.columns)
+    sizes = [size for size in sizes if size != given and min(size[1:]) >= 2]
+    over = {(b, a): blob for (a, b), blob in cells.items()}  # axes may be named either way round, and are only turned
+    for kind, rows, columns in sorted(sizes, key=lambda size: _unlikeness(size, given)):
+        other = CircleGrid(kind, rows, columns, 2 * LEAST_GAP_MM, LEAST_GAP_MM)
+        if any(_laid(lattice, blobs, _lattice_cells(other), other) for lattice in (cells, over)):
+            return f", but looks like {rows} rows, {columns} columns" + f" of {kind}" * (kind != grid.kind)
+    return ""
+
+
+def _extent(places: NDArray[np.int64]) -> int:
+    """How many lines of a lattice there are from the first to the last, those with a single circle not counted."""
+    lines, count = np.unique(places, return_counts=True)
+    return int(np.ptp(lines[count > 1])) + 1 if (count > 1).any() else 0
+
+
+def _unlikeness(size: tuple[Kind, int, int], given: tuple[Kind, int, int]) -> tuple[bool, int]:
+    return size[0] != given[0], abs(size[1] - given[1]) + abs(size[2] - given[2])

@@ -123,17 +123,33 @@ def test_an_outer_row_that_is_hidden_may_be_that_of_either_side() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    ("wrong", "instead"),
     [
-        CircleGrid("asymmetric_circles", 10, 4, 20.0, 14.0),
-        CircleGrid("asymmetric_circles", 4, 11, 20.0, 14.0),
-        CircleGrid("asymmetric_circles", 12, 4, 20.0, 14.0),
-        CircleGrid("symmetric_circles", 11, 4, 20.0, 14.0),
+        (CircleGrid("asymmetric_circles", 10, 4, 20.0, 14.0), "but looks like 11 rows, 4 columns: check"),
+        (CircleGrid("asymmetric_circles", 4, 11, 20.0, 14.0), "but looks like 11 rows, 4 columns: check"),
+        (
+            CircleGrid("asymmetric_circles", 12, 4, 20.0, 14.0),
+            "or the sheet has other rows and columns, but looks like 11",
+        ),
+        (CircleGrid("symmetric_circles", 11, 4, 20.0, 14.0), "11 rows, 4 columns of asymmetric_circles"),
+        (CircleGrid("symmetric_circles", 11, 8, 20.0, 14.0), "11 rows, 4 columns of asymmetric_circles"),
     ],
 )
-def test_another_pattern_than_the_one_given_is_refused(wrong: CircleGrid) -> None:
-    with pytest.raises(GridError, match="circles"):
+def test_another_pattern_than_the_one_given_is_refused_and_what_it_looks_like_is_said(
+    wrong: CircleGrid, instead: str
+) -> None:
+    with pytest.raises(GridError, match=f"circles.*{instead}"):
         find_grid(drawn(TALL, view(TALL)), wrong)
+
+
+def test_a_dot_beside_the_sheet_makes_no_row() -> None:
+    matrix = view(TALL, turn_deg=90)
+    picture = drawn(TALL, matrix)
+    x, y = (centres(TALL, matrix)[40] + (centres(TALL, matrix)[40] - centres(TALL, matrix)[32]) / 2).astype(int)
+    cv2.circle(picture, (int(x), int(y)), 12, 40, -1)
+    assert find_grid(picture, TALL).seen.all()
+    with pytest.raises(GridError, match="looks like 11 rows, 4 columns"):
+        find_grid(picture, CircleGrid("asymmetric_circles", 12, 4, 20.0, 14.0))
 
 
 def test_a_mirrored_grid_of_even_rows_is_refused() -> None:
