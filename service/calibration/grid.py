@@ -419,7 +419,7 @@ def _likeness(cells: dict[Cell, int], blobs: _Blobs, grid: CircleGrid) -> str:
     for kind, rows, columns in sorted(sizes, key=lambda size: _unlikeness(size, given)):
         other = CircleGrid(kind, rows, columns, 2 * LEAST_GAP_MM, LEAST_GAP_MM)
         if any(_laid(lattice, blobs, _lattice_cells(other), other) for lattice in (cells, over)):
-            return f", but looks like {rows} rows, {columns} columns" + f" of {kind}" * (kind != grid.kind)
+            return f"; it looks like {rows} rows, {columns} columns" + f" of {kind}" * (kind != grid.kind)
     return ""
 
 

@@ -125,11 +125,11 @@ def test_an_outer_row_that_is_hidden_may_be_that_of_either_side() -> None:
 @pytest.mark.parametrize(
     ("wrong", "instead"),
     [
-        (CircleGrid("asymmetric_circles", 10, 4, 20.0, 14.0), "but looks like 11 rows, 4 columns: check"),
-        (CircleGrid("asymmetric_circles", 4, 11, 20.0, 14.0), "but looks like 11 rows, 4 columns: check"),
+        (CircleGrid("asymmetric_circles", 10, 4, 20.0, 14.0), "it looks like 11 rows, 4 columns: check"),
+        (CircleGrid("asymmetric_circles", 4, 11, 20.0, 14.0), "it looks like 11 rows, 4 columns: check"),
         (
             CircleGrid("asymmetric_circles", 12, 4, 20.0, 14.0),
-            "or the sheet has other rows and columns, but looks like 11",
+            "or the sheet has other rows and columns; it looks like 11",
         ),
         (CircleGrid("symmetric_circles", 11, 4, 20.0, 14.0), "11 rows, 4 columns of asymmetric_circles"),
         (CircleGrid("symmetric_circles", 11, 8, 20.0, 14.0), "11 rows, 4 columns of asymmetric_circles"),
@@ -145,7 +145,7 @@ def test_another_pattern_than_the_one_given_is_refused_and_what_it_looks_like_is
 def test_a_dot_beside_the_sheet_makes_no_row() -> None:
     matrix = view(TALL, turn_deg=90)
     picture = drawn(TALL, matrix)
-    x, y = (centres(TALL, matrix)[40] + (centres(TALL, matrix)[40] - centres(TALL, matrix)[32]) / 2).astype(int)
+    x, y = (2 * centres(TALL, matrix)[36] - centres(TALL, matrix)[28]).astype(int)  # where a twelfth row would begin
     cv2.circle(picture, (int(x), int(y)), 12, 40, -1)
     assert find_grid(picture, TALL).seen.all()
     with pytest.raises(GridError, match="looks like 11 rows, 4 columns"):
