@@ -186,6 +186,8 @@ def calibrate(
     from service.calibration_folder import calibrate_folder, summary
     from service.inference.images import ImageLimits
 
+    if method == "paper" and focus_distance_m is None:
+        raise _failure("--method paper needs --focus-distance-m: it cannot find it", WRONG_USE)
     settings = _settings()
     limits = ImageLimits.of(settings)
     with _plain_failures():

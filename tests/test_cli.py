@@ -118,6 +118,8 @@ def test_a_folder_without_a_calibration_says_why(tmp_path: Path) -> None:
     none = camind(tmp_path, "calibrate", str(tmp_path / "photos"))
     assert (none.returncode, none.stderr.count("Traceback")) == (2, 0)
     assert "no photographs" in none.stderr
+    paper = camind(tmp_path, "calibrate", str(tmp_path / "photos"), "--method", "paper")
+    assert (paper.returncode, "--method paper needs --focus-distance-m" in paper.stderr) == (2, True)
     cv2.imwrite(str(tmp_path / "photos" / "grey.png"), np.full((300, 400, 3), 128, np.uint8))
     grey = camind(tmp_path, "calibrate", str(tmp_path / "photos"), "--out", str(tmp_path / "grey.json"))
     assert grey.returncode == 1

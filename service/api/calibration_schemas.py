@@ -67,7 +67,12 @@ class CalibrationSettings(Given):
     pattern: Pattern
     focus_distance_m: Annotated[
         float | None,
-        Field(ge=0.01, le=1_000, allow_inf_nan=False, description="Where the lens is focused; null: find it"),
+        Field(
+            ge=0.01,
+            le=1_000,
+            allow_inf_nan=False,
+            description="Where the lens is focused; null: find it, which the method `paper` cannot",
+        ),
     ] = None
     method: Annotated[Method, Field(description="How the blur of a circle is read")] = "edge"
     # "register" is what every class of models can do already
@@ -83,6 +88,8 @@ class CalibrationSettings(Given):
         except ValidationError as exc:
             raise invalid_request([_in_field(dict(fault)) for fault in exc.errors()]) from exc
         settings.to_grid()
+        if settings.method == "paper" and settings.focus_distance_m is None:
+            raise _fault("focus_distance_m", "The paper's method needs the focus distance: it cannot find it.")
         return settings
 
     def to_grid(self) -> CircleGrid:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.calibration import fit
-from service.calibration.edge import find_spread, fit_again
+from service.calibration.edge import Spread, find_spread, fit_again
 from service.calibration.measure import LEAST_CIRCLES, Measured, measure
-from service.calibration.pose import Placement, PoseError, place
+from service.calibration.pose import FEW_VIEWS, Placement, PoseError, place
 from service.calibration.report import Method, PictureReport, Report, Result, Role, Sample
 from service.calibration.target import CircleGrid
 from service.errors import CamindError
@@ -25,6 +25,8 @@ TELL_EVERY_S = 1.0
 FITTING_PART = 0.2  # of the progress
 BAD_VIEW = 4.0
 LEAST_BAD_PX = 1.5
+SAME_VIEW_PX = 0.05  # rms, between the centres of two pictures' circles
+MOST_ODD = 1 / 3  # of the pictures, that may be left out for being blurred otherwise
 CENTRE_TO, CORNER_FROM = 0.4, 0.7
 FIELD_DIFFERENCE = 0.1
 LEAST_FIELD_CIRCLES = 12
@@ -93,7 +95,7 @@ def calibrate(
             measured.append(one)
             teller.reports.append(one.report)
         try:
-            result = _fitted(task, measured, lambda part: teller.at(1 - FITTING_PART + FITTING_PART * part))
+            result = _result(task, measured, lambda part: teller.at(1 - FITTING_PART + FITTING_PART * part))
         except (PoseError, fit.FitError) as error:
             return Report(tuple(one.report for one in measured), None, str(error))
     return Report(tuple(one.report for one in measured), result, None)
@@ -119,23 +121,28 @@ def _measured(task: Task, picture: Picture, at: Callable[[float], None], partner
     return out
 
 
-def _fitted(task: Task, measured: list[Measured], at: Callable[[float], None]) -> Result:
+@dataclass(frozen=True, slots=True)
+class _Fitted:
+    """Those pictures that count, where their sheets stood, how they are blurred, and what fits them all best."""
+
+    usable: list[Measured]
+    placement: Placement
+    spread: Spread
+    circles: fit.Circles
+    constants: fit.Constants
+
+
+def _result(task: Task, measured: list[Measured], at: Callable[[float], None]) -> Result:
     size_px, usable = _of_one_size(measured)
-    placement, usable = _placed(task.grid, usable, size_px)
+    found = _fitted(task, _distinct(usable), size_px, at)
+    like_others = _like_others(task, found)
+    if len(like_others) < len(found.usable):
+        found = _fitted(task, like_others, size_px, at)
+    usable, placement, circles = found.usable, found.placement, found.circles
+    constants = _constants(task, circles, placement, tick=lambda: at(0.8))
     for one, distance, tilt in zip(usable, placement.distance_m, placement.tilt_deg, strict=True):
-        one.report = replace(one.report, distance_m=distance, tilt_deg=tilt)
-    circles = _circles(usable, placement)
-    at(0.0)
-    constants = _constants(task, circles, placement, resamples=0 if task.method == "edge" else fit.RESAMPLES)
-    spread = find_spread([edge for one in usable for edge in one.edges], constants.gamma_px.value, lambda: at(0.1))
-    if task.method == "edge":
-        for number, one in enumerate(usable):
-            at(0.1 + 0.6 * number / len(usable))
-            one.edges = [fit_again(edge, spread) for edge in one.edges]
-        circles = _circles(usable, placement)
-        constants = _constants(task, circles, placement, tick=lambda: at(0.8))
-    for one in usable:
-        one.report = replace(one.report, blur_px=float(np.median(one.blur_px())))
+        blur_px = float(np.median(one.blur_px()))
+        one.report = replace(one.report, distance_m=distance, tilt_deg=tilt, blur_px=blur_px)
     samples = tuple(_samples(usable, circles, constants))
     corners = _corner_ratio(samples, placement, size_px)
     return Result(
@@ -143,7 +150,7 @@ def _fitted(task: Task, measured: list[Measured], at: Callable[[float], None]) -
         k_cam_px=constants.k_cam_px,
         gamma_px=constants.gamma_px,
         focus_distance_m=constants.focus_distance_m,
-        point_spread=spread.shape,
+        point_spread=found.spread.shape,
         intrinsics=placement.intrinsics,
         reprojection_rms_px=placement.overall_rms_px,
         samples=samples,
@@ -156,6 +163,38 @@ def _fitted(task: Task, measured: list[Measured], at: Callable[[float], None]) -
             *_uneven(corners),
         ),
     )
+
+
+def _fitted(task: Task, usable: list[Measured], size_px: tuple[int, int], at: Callable[[float], None]) -> _Fitted:
+    """The fit without its intervals, every circle read under the point spread that suits them all."""
+    placement, usable = _placed(task.grid, usable, size_px)
+    circles = _circles(usable, placement)
+    at(0.0)
+    constants = _constants(task, circles, placement, resamples=0)
+    spread = find_spread([edge for one in usable for edge in one.edges], constants.gamma_px.value, lambda: at(0.1))
+    if task.method == "edge":
+        for number, one in enumerate(usable):
+            at(0.1 + 0.6 * number / len(usable))
+            one.edges = [fit_again(edge, spread) for edge in one.edges]
+        circles = _circles(usable, placement)
+        constants = _constants(task, circles, placement, resamples=0)
+    return _Fitted(usable, placement, spread, circles, constants)
+
+
+def _like_others(task: Task, found: _Fitted) -> list[Measured]:
+    """The pictures without those few that are blurred as no camera of the others would, which are told so.
+
+    All of them where these are many, for then nobody knows which are right, or where hardly any would be left.
+    """
+    usable, odd = found.usable, fit.odd_pictures(found.circles, found.constants)
+    left = len(usable) - len(odd)
+    if task.method != "edge" or len(odd) > MOST_ODD * len(usable) or left < FEW_VIEWS:
+        return usable
+    for number in odd:
+        usable[number].warn(
+            "left out: its circles are blurred otherwise than those of the others: did it move, or was it refocused?"
+        )
+    return [one for number, one in enumerate(usable) if number not in odd]
 
 
 def _constants(
@@ -190,6 +229,26 @@ def _of_one_size(measured: list[Measured]) -> tuple[tuple[int, int], list[Measur
         else:
             one.warn(f"left out: {one.size_px[0]}x{one.size_px[1]} px, while most are {size_px[0]}x{size_px[1]}")
     return size_px, usable
+
+
+def _distinct(measured: list[Measured]) -> list[Measured]:
+    """Those that show the sheet in one place once: the same photograph again tells nothing new."""
+    kept: list[Measured] = []
+    for one in measured:
+        same = next((other for other in kept if _is_same_view(one, other)), None)
+        if same is None:
+            kept.append(one)
+        else:
+            one.warn(f"left out: the same photograph as {same.report.name}, or another of the very same view")
+    return kept
+
+
+def _is_same_view(one: Measured, other: Measured) -> bool:
+    _, here, there = np.intersect1d(one.circles, other.circles, return_indices=True)
+    if one.report.role != other.report.role or len(here) < LEAST_CIRCLES:
+        return False
+    apart_px = np.array(one.centres_px)[here] - np.array(other.centres_px)[there]
+    return float(np.sqrt((apart_px**2).sum(1).mean())) < SAME_VIEW_PX
 
 
 def _placed(grid: CircleGrid, measured: list[Measured], size_px: tuple[int, int]) -> tuple[Placement, list[Measured]]:

@@ -33,6 +33,7 @@ LEAST_CONTRAST = 0.08
 MOST_RESIDUAL = 0.1
 MOST_STRETCH = 2.5
 MOST_SHIFT, OTHER_SIZE = 0.5, 1.6
+OUTER_RADII, DARK, DARK_PART, ONE_SIDED = 1.4, 0.7, 0.05, 0.4  # white that ends: where, to what, how much, which way
 PROFILE_POINTS = 256
 BOX_SHOWS_BELOW_PX = 1.2  # a wider blur is as good as a Gaussian of its own width
 LEAST_REST_PX = 0.1
@@ -358,6 +359,8 @@ def _check(fit: EdgeFit, x_px: float, y_px: float, radius_px: float) -> None:
     if fit.contrast < LEAST_CONTRAST:
         raise EdgeError(f"the circle is too faint: it takes away {fit.contrast:.0%} of the light")
     if fit.residual > MOST_RESIDUAL:
+        if _is_dark_beside(fit):
+            raise EdgeError("the paper ends too near the circle: leave a white margin of a circle's diameter")
         raise EdgeError("what is there does not look like a blurred circle")
     if fit.semi_axes_px[0] > MOST_STRETCH * fit.semi_axes_px[1]:
         raise EdgeError("the sheet is too tilted: the circle is seen as a narrow ellipse")
@@ -365,3 +368,16 @@ def _check(fit: EdgeFit, x_px: float, y_px: float, radius_px: float) -> None:
     is_of_other_size = not 1 / OTHER_SIZE < fit.radius_px / radius_px < OTHER_SIZE
     if is_elsewhere or is_of_other_size:
         raise EdgeError("what is there is not the circle that was looked for")
+
+
+def _is_dark_beside(fit: EdgeFit) -> bool:
+    """Whether what is about the disc is dark, on one side: paper that ends, where there should be white all around."""
+    patch = fit.patch
+    away = np.stack([patch.columns + patch.left - fit.x_px, patch.rows + patch.top - fit.y_px])
+    distance = np.hypot(*away)
+    is_outer = distance > OUTER_RADII * fit.radius_px
+    is_dark = is_outer & (patch.light < DARK * np.quantile(patch.light, 0.9))
+    if is_dark.sum() < DARK_PART * is_outer.sum():
+        return False
+    towards = (away[:, is_dark] / distance[is_dark]).mean(1)
+    return bool(np.hypot(*towards) > ONE_SIDED)

@@ -9,6 +9,7 @@ they trade against each other, and the intervals and warnings say so.
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,8 @@ SHAPE_ERROR, PIXEL_ERROR_PX, FOCUS_ERROR = 0.003, 0.005, 5e-4  # of blur, gamma,
 CONFIDENCE = 0.95
 OUTLIER = 5.0
 LOOSE = 0.2
+CHECKS = 40  # resamples for what the circles say of a focus distance that is given
+OFF, FAR_OFF = 1.02, 1.08  # of a focus distance that is given: from where it is warned of, and from where refused
 CURVE_POINTS, CURVE_BEYOND = 60, 1.05
 FENCE = 1.5  # quartile ranges beyond the quartiles: outliers as a box plot has them
 LEAST_EXCESS = 0.05
@@ -70,6 +73,9 @@ class Circles:
     def excess(self, focus_m: float) -> Array:
         """|s1/z - 1|, 0 where the lens was focused on the sheet."""
         return np.where(self.is_focused, 0.0, thin_lens.relative_defocus(self.depth_m, focus_m))
+
+
+Fit = Callable[[Circles, Array | None], Array]  # to constants, from others near by
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,11 +133,55 @@ def fit_constants(
     if defocused.sum() < LEAST_CIRCLES:
         raise FitError(f"{defocused.sum()} defocused circles were measured; at least {LEAST_CIRCLES} are needed")
 
-    def fit(some: Circles, start: Array | None) -> Array:
+    def fit_at(focus_m: float | None, some: Circles, start: Array | None) -> Array:
         tick()
-        return _fitted(some, focus_distance_m, start)
+        return _fitted(some, focus_m, start)
 
-    return _constants(circles, fit, focus_distance_m, depth_error, resamples, seed)
+    told = None
+    if focus_distance_m is not None:
+        told = _otherwise(focus_distance_m, _own_focus(circles, partial(fit_at, None), depth_error, seed))
+    found = _constants(circles, partial(fit_at, focus_distance_m), focus_distance_m, depth_error, resamples, seed)
+    if told is None:
+        return found
+    if found.k_cam_px.low <= 0:
+        raise FitError(told)
+    return replace(found, warnings=(told, *found.warnings))
+
+
+def _own_focus(circles: Circles, fit: Fit, depth_error: float, seed: int) -> Interval | None:
+    """The focus distance that circles on both sides of it tell by themselves; None where they tell none well."""
+    best = fit(circles, None)
+    depth_m = circles.depth_m[~circles.is_focused]
+    if not depth_m.min() < best[2] < depth_m.max():
+        return None
+    drawn = _resampled(circles, fit, best, None, depth_error, CHECKS, seed)
+    k_cam, focus = (_interval(best[i], drawn[:, i], _widening(circles)) for i in (0, 2))
+    return focus if max(k_cam.relative_width, focus.relative_width) < LOOSE else None
+
+
+def _otherwise(given_m: float, own: Interval | None) -> str | None:
+    """What to say where the circles tell another focus distance than was given. ``FitError`` if quite another."""
+    if own is None or own.low / OFF <= given_m <= own.high * OFF:
+        return None
+    told = (
+        f"the photographs say {own.value:.3f} m ({own.low:.3f} to {own.high:.3f}), not the {given_m:g} m given: check "
+        "focus_distance_m, or leave it out, and the sheet's spacing"
+    )
+    if not 1 / FAR_OFF < given_m / own.value < FAR_OFF:
+        raise FitError(told)
+    return told
+
+
+def odd_pictures(circles: Circles, constants: Constants) -> list[int]:
+    """The pictures of which most circles are outliers, and as far off as no curve may be."""
+    found = np.array([constants.k_cam_px.value, constants.gamma_px.value, constants.focus_distance_m.value])
+    off = np.abs(_model(found, circles) / circles.blur_px - 1)
+    return [
+        int(picture)
+        for picture in np.unique(circles.picture)
+        if constants.is_outlier[circles.picture == picture].mean() > 1 / 2
+        and float(np.median(off[circles.picture == picture])) > MISFIT
+    ]
 
 
 def fit_as_paper(
@@ -173,7 +223,7 @@ def per_circle_k_cam(circles: Circles, gamma_px: float, focus_m: float) -> Array
 
 def _constants(
     circles: Circles,
-    fit: Callable[[Circles, Array | None], Array],
+    fit: Fit,
     focus_m: float | None,
     depth_error: float,
     resamples: int,
@@ -188,8 +238,7 @@ def _constants(
     rest = _left_over(best, circles)
     scale = max(1.4826 * float(np.median(np.abs(rest))), 1e-6)
     drawn = _resampled(circles, fit, best, focus_m, depth_error, resamples, seed) if resamples else best[None]
-    pictures = np.unique(circles.picture).size
-    widen = _widening(pictures if pictures > 1 else circles.depth_m.size)
+    widen = _widening(circles)
     k_cam, gamma, focus = (_interval(best[i], drawn[:, i], widen) for i in range(3))
     return Constants(
         k_cam_px=k_cam,
@@ -247,7 +296,7 @@ def _start(circles: Circles, focus_m: float) -> Array:
 
 def _resampled(
     circles: Circles,
-    fit: Callable[[Circles, Array | None], Array],
+    fit: Fit,
     best: Array,
     focus_m: float | None,
     depth_error: float,
@@ -277,8 +326,10 @@ def _resampled(
     return np.maximum(np.array(rows), 0.0)
 
 
-def _widening(groups: int) -> float:
-    """What a bootstrap over few groups is too narrow by."""
+def _widening(circles: Circles) -> float:
+    """What a bootstrap over few pictures (over circles, if there is one) is too narrow by."""
+    pictures = np.unique(circles.picture).size
+    groups = pictures if pictures > 1 else circles.depth_m.size
     return float(stdtrit(groups - 1, (1 + CONFIDENCE) / 2) / 1.96 * math.sqrt(groups / (groups - 1)))
 
 
@@ -311,7 +362,11 @@ def _warnings(circles: Circles, found: tuple[Interval, Interval, Interval], *, i
         side = "nearer than" if near else "beyond"
         told.append(f"all circles are {side} the focus: photograph both sides, or give the focus distance")
     if max(k_cam.relative_width, focus.relative_width) > LOOSE:
-        told.append("the pictures do not separate k_cam_px and focus_distance_m well: see their intervals")
+        told.append(
+            "the pictures do not tell k_cam_px well: see its interval"
+            if is_focus_given
+            else "the pictures do not separate k_cam_px and focus_distance_m well: see their intervals"
+        )
     model = _model(np.array([k_cam.value, gamma.value, focus.value]), circles)
     off = float(np.median(np.abs(model / circles.blur_px - 1)))
     if off > MISFIT:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from service.calibration.target import CircleGrid
+from service.calibration.target import LEAST_GAP_MM, CircleGrid, Kind
 from service.opencv import cv2
 
 COARSEST_PX = 640
@@ -29,6 +29,7 @@ LEAST_CIRCULARITY = 0.6
 LEAST_CONVEXITY = 0.85
 LEAST_INERTIA = 0.15
 NEIGHBOURS = 8
+NESTED = 3  # blobs in one place, of which one may be a circle and another the outline of the sheet about it
 SEEDS = 40
 MOST_TRIES = 16  # at laying a lattice, each from another seed or along other axes
 MOST_GROWN = 4  # times the circles wanted: a lattice that goes on is not the pattern
@@ -153,7 +154,7 @@ def _find(grey: NDArray[np.uint8], grid: CircleGrid, check: Callable[[], None]) 
                 return found
             if tries == MOST_TRIES:
                 break
-    raise GridError(_why(best, blobs, wanted, grey.shape))
+    raise GridError(_why(best, blobs, wanted, grid, grey.shape))
 
 
 def _blobs(grey: NDArray[np.uint8], check: Callable[[], None]) -> _Blobs:
@@ -197,15 +198,31 @@ def _seen_at(threshold: float, grey: NDArray[np.uint8]) -> Array:
 
 
 def _continued(found: Array, last: Array) -> NDArray[np.intp]:
-    """The number of each blob [n,3]: the one it had in ``last`` where it goes on, else the next one that is free."""
+    """The number of each blob [n,3]: the one it had in ``last`` where it goes on, else the next one that is free.
+
+    One of another size is another one: the sheet's outline about the circle in its middle.
+    """
     numbers = np.full(len(found), -1, np.intp)
     if len(last) and len(found):
-        away, nearest = cKDTree(last[:, :2]).query(found[:, :2])
-        radius = np.maximum(found[:, 2], last[nearest, 2]) / 2
-        numbers = np.where(away < np.maximum(radius, LEAST_APART_PX), nearest, numbers)
+        away, near = _nearest(cKDTree(last[:, :2]), found[:, :2])
+        size, before = found[:, 2, None], last[near, 2]
+        goes_on = away < np.maximum(np.maximum(size, before) / 2, LEAST_APART_PX)
+        goes_on &= _is_alike(size / before)
+        numbers = np.where(goes_on.any(1), near[np.arange(len(near)), goes_on.argmax(1)], numbers)
     is_new = numbers < 0
     numbers[is_new] = len(last) + np.arange(is_new.sum())
     return numbers
+
+
+def _nearest(tree: cKDTree, places: Array) -> tuple[Array, NDArray[np.intp]]:
+    """How far the few blobs nearest to a place [..., 2] are, and which, the nearest first [..., few]."""
+    away, near = tree.query(places, np.arange(1, min(NESTED, tree.n) + 1))
+    return np.asarray(away, np.float64), np.asarray(near, np.intp)
+
+
+def _is_alike(ratio: Array) -> NDArray[np.bool_]:
+    """Whether sizes of which these are the ratios may be those of one circle, or of two that are neighbours."""
+    return (ratio < LIKE_SIZE) & (ratio > 1 / LIKE_SIZE)
 
 
 def _seeds(blobs: _Blobs) -> Iterator[tuple[int, Array, Array]]:
@@ -217,7 +234,7 @@ def _seeds(blobs: _Blobs) -> Iterator[tuple[int, Array, Array]]:
     for first in np.argsort(evenness + 2 * alike)[:SEEDS]:
         steps = blobs.places[others[first, 1:]] - blobs.places[first]
         sizes = blobs.sizes[others[first, 1:]] / blobs.sizes[first]
-        steps = steps[(sizes < LIKE_SIZE) & (sizes > 1 / LIKE_SIZE)]
+        steps = steps[_is_alike(sizes)]
         for i in range(min(4, len(steps))):
             for j in range(i + 1, min(5, len(steps))):
                 u, v = steps[i], steps[j]
@@ -243,12 +260,13 @@ def _grown(blobs: _Blobs, first: int, u: Array, v: Array, most: int) -> dict[Cel
             if beside in cells:
                 continue
             step = sign * basis[axis]
-            away, found = blobs.tree.query(here + step)
-            size = blobs.sizes[found] / blobs.sizes[cells[cell]]
-            if found in taken or away > REACH * np.linalg.norm(step) or not 1 / LIKE_SIZE < size < LIKE_SIZE:
+            away, near = _nearest(blobs.tree, here + step)
+            is_next = (away < REACH * np.linalg.norm(step)) & _is_alike(blobs.sizes[near] / blobs.sizes[cells[cell]])
+            found = next((int(blob) for blob in near[is_next] if int(blob) not in taken), None)
+            if found is None:
                 continue
-            cells[beside] = int(found)
-            taken.add(int(found))
+            cells[beside] = found
+            taken.add(found)
             bases[beside] = _basis(cells, blobs, beside, basis)
             edge.append(beside)
     return cells
@@ -288,22 +306,35 @@ def _laid(cells: dict[Cell, int], blobs: _Blobs, wanted: list[Cell], grid: Circl
     if most < LEAST_FOUND * len(wanted) or len(cells) - most > spare:
         return None
     options = []
+    covered = set()
     for turn, shift, hits in ways:
         if hits == most:
-            chosen = [cells.get(_moved(cell, turn, shift)) for cell in wanted]
+            moved = [_moved(cell, turn, shift) for cell in wanted]
+            covered.add(frozenset(moved))
+            chosen = [cells.get(cell) for cell in moved]
             seen = np.array([blob is not None for blob in chosen])
             places = np.array([blobs.places[blob] if blob is not None else (np.nan, np.nan) for blob in chosen])
             options.append((places, seen))
-    if most < len(wanted) and len({tuple(seen) for _, seen in options}) > 1:
-        return None  # an outer row may be missing on either side
+    if most < len(wanted) and len(covered) > 1:
+        return None  # what is missing may be so on either side
     fronts = [option for option in options if _is_from_front(grid, *option)]
     if not fronts:
         return None
     places, seen = min(fronts, key=lambda option: _turn_to_upright(grid, *option))
+    if not _shows_all_sides(seen.reshape(grid.rows, grid.columns)):
+        return None
     if not seen.all():
         matrix, _ = cv2.findHomography(grid.points_mm()[seen], places[seen], 0)
         places[~seen] = projected(np.asarray(matrix), grid.points_mm()[~seen])
     return FoundGrid(places, np.zeros(len(places)), seen)
+
+
+def _shows_all_sides(seen: NDArray[np.bool_]) -> bool:
+    """Whether all four outer rows and columns are there [rows, columns]: else the sheet may have fewer.
+
+    A single circle of one is not enough, for it may be something that lies beside the sheet.
+    """
+    return all(side.sum() >= min(2, side.size - 1) for side in (seen[0], seen[-1], seen[:, 0], seen[:, -1]))
 
 
 def _moved(cell: Cell, turn: int, shift: Cell) -> Cell:
@@ -346,10 +377,10 @@ def _turn_to_upright(grid: CircleGrid, places: Array, seen: NDArray[np.bool_]) -
     return abs(math.atan2(right[1], right[0]))
 
 
-def _why(cells: dict[Cell, int], blobs: _Blobs, wanted: list[Cell], shape: tuple[int, ...]) -> str:
+def _why(cells: dict[Cell, int], blobs: _Blobs, wanted: list[Cell], grid: CircleGrid, shape: tuple[int, ...]) -> str:
     """What the largest lattice that was seen has of the pattern, in words."""
     if len(cells) < max(6, 0.3 * len(wanted)):
-        return "no grid of dark circles was found"
+        return NOTHING
     places = blobs.places[list(cells.values())]
     step = float(np.median(np.asarray(blobs.tree.query(places, 2)[0])[:, 1]))
     low, high = places.min(0), places.max(0)
@@ -360,9 +391,43 @@ def _why(cells: dict[Cell, int], blobs: _Blobs, wanted: list[Cell], shape: tuple
             "rows and columns"
         )
     if len(cells) < len(wanted):
-        return f"only {len(cells)} of the grid's {len(wanted)} circles were seen; the rest is hidden or too faint"
-    at_least = "at least " if len(cells) >= MOST_GROWN * len(wanted) else ""
-    return (
-        f"a grid of {at_least}{len(cells)} circles was seen that is not the pattern given ({len(wanted)} circles): "
-        "check kind, rows and columns, and that the picture is not mirrored"
-    )
+        return (
+            f"only {len(cells)} of the grid's {len(wanted)} circles were seen; the rest is hidden or too faint, or the "
+            f"sheet has other rows and columns{_likeness(cells, blobs, grid)}"
+        )
+    if len(cells) >= MOST_GROWN * len(wanted):
+        seen = f"at least {len(cells)} circles was seen that is not the pattern given ({len(wanted)} circles)"
+    else:
+        likeness = _likeness(cells, blobs, grid)
+        seen = f"{len(cells)} circles was seen that is not the pattern given ({len(wanted)} circles){likeness}"
+    return f"a grid of {seen}: check kind, rows and columns, and that the picture is not mirrored"
+
+
+def _likeness(cells: dict[Cell, int], blobs: _Blobs, grid: CircleGrid) -> str:
+    """Which pattern the lattice looks like instead, the one most like the one given, to be said after it."""
+    a, b = np.array(list(cells)).T
+    across, along, rising, falling = (_extent(places) for places in (a, b, a + b, a - b))
+    sizes: list[tuple[Kind, int, int]] = [
+        ("symmetric_circles", across, along),
+        ("symmetric_circles", along, across),
+        ("asymmetric_circles", rising, falling // 2),
+        ("asymmetric_circles", falling, rising // 2),
+    ]
+    given = (grid.kind, grid.rows, grid.columns)
+    sizes = [size for size in sizes if size != given and min(size[1:]) >= 2]
+    over = {(b, a): blob for (a, b), blob in cells.items()}  # axes may be named either way round, and are only turned
+    for kind, rows, columns in sorted(sizes, key=lambda size: _unlikeness(size, given)):
+        other = CircleGrid(kind, rows, columns, 2 * LEAST_GAP_MM, LEAST_GAP_MM)
+        if any(_laid(lattice, blobs, _lattice_cells(other), other) for lattice in (cells, over)):
+            return f"; it looks like {rows} rows, {columns} columns" + f" of {kind}" * (kind != grid.kind)
+    return ""
+
+
+def _extent(places: NDArray[np.int64]) -> int:
+    """How many lines of a lattice there are from the first to the last, those with a single circle not counted."""
+    lines, count = np.unique(places, return_counts=True)
+    return int(np.ptp(lines[count > 1])) + 1 if (count > 1).any() else 0
+
+
+def _unlikeness(size: tuple[Kind, int, int], given: tuple[Kind, int, int]) -> tuple[bool, int]:
+    return size[0] != given[0], abs(size[1] - given[1]) + abs(size[2] - given[2])

@@ -298,6 +298,7 @@ def change_pattern(**change: JsonValue) -> dict[str, JsonValue]:
         ({"is_to_register": True}, "#/settings/is_to_register"),
         ({"register": "yes"}, "#/settings/register"),
         ({"method": "guess"}, "#/settings/method"),
+        ({"method": "paper"}, "#/settings/focus_distance_m"),
         ({"focus_distance_m": 0}, "#/settings/focus_distance_m"),
         ({"focus_distance_m": 1001}, "#/settings/focus_distance_m"),
         ({"focus_distance_m": "2"}, "#/settings/focus_distance_m"),

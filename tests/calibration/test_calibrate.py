@@ -13,6 +13,7 @@ from service.calibration.plot import as_svg
 from service.calibration.report import PictureReport, Report
 from service.errors import InvalidImage
 from service.inference.cancellation import Cancelled
+from service.opencv import cv2
 from tests.simulated_sheets import CAMERA, DEPTHS_M, GRID, Shot, shots
 
 
@@ -57,6 +58,14 @@ def test_the_plot_is_the_same_picture_every_time(report: Report) -> None:
     assert as_svg(report.result) == drawn
     samples = tuple(replace(sample, image="a$_{$.jpg") for sample in report.result.samples)
     assert b"a$_{$.jpg" in as_svg(replace(report.result, samples=samples))
+
+
+def test_a_focus_distance_far_off_what_the_photographs_say_is_a_problem(taken: list[Shot]) -> None:
+    report = calibrate(Task(GRID, 0.6), pictures(taken))
+    assert report.result is None
+    assert report.problem is not None
+    assert report.problem.startswith("the photographs say 0.50")
+    assert "not the 0.6 m given: check focus_distance_m" in report.problem
 
 
 def test_pairs_as_in_the_paper_by_both_methods() -> None:
@@ -109,6 +118,31 @@ def test_another_camera_among_them_is_left_out_or_warned_of(taken: list[Shot]) -
     report = calibrate(Task(GRID), pictures([*taken, *small]))
     assert "left out: 400x300 px, while most are 800x600" in report.pictures[-1].warnings
     assert report.result is not None
+
+
+def moved(shot: Shot) -> Shot:
+    """The photograph as it would be if the camera had moved along while it was taken."""
+    name, role, pixels = shot
+    return name, role, np.asarray(cv2.blur(pixels, (9, 1)), np.uint8)
+
+
+def test_one_that_moved_and_one_that_was_there_before_are_left_out(taken: list[Shot]) -> None:
+    again: Shot = ("again", "defocused", taken[4][2])
+    report = calibrate(Task(GRID), pictures([*taken[:2], moved(taken[2]), *taken[3:], again]))
+    told = [picture.warnings for picture in report.pictures]
+    assert [bool(words) for words in told] == [False, False, True, False, False, False, True]
+    assert told[2][0].startswith("left out: its circles are blurred otherwise than those of the others")
+    assert told[6][0].startswith(f"left out: the same photograph as {taken[4][0]}")
+    assert report.result is not None
+    assert report.result.k_cam_px.value == pytest.approx(4.0, rel=0.04)
+    assert report.result.k_cam_px.low < 4.0 < report.result.k_cam_px.high
+    assert report.result.k_cam_px.relative_width < 0.1
+    assert {sample.image for sample in report.result.samples} == {taken[i][0] for i in (0, 1, 3, 4, 5)}
+
+
+def test_of_four_photographs_none_is_left_out_for_its_blur(taken: list[Shot]) -> None:
+    report = calibrate(Task(GRID), pictures([taken[0], moved(taken[2]), *taken[4:]]))
+    assert not any(words.startswith("left out") for picture in report.pictures for words in picture.warnings)
 
 
 def test_what_is_no_photograph_is_said_and_the_others_count(taken: list[Shot]) -> None:

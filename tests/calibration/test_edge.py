@@ -76,6 +76,15 @@ def test_a_tilted_circle_under_uneven_light_is_read_alike() -> None:
     assert found.semi_axes_px == pytest.approx((24, 24 * 0.88), rel=0.02)
 
 
+@pytest.mark.parametrize("sigma", [0.5, 4.0])
+@pytest.mark.parametrize(("right", "bottom"), [(94, SIZE), (SIZE, 92), (94, 94)])
+def test_paper_that_ends_beside_the_circle_is_said(right: int, bottom: int, sigma: float) -> None:
+    printed = circle()
+    printed[:, right:] = printed[bottom:] = 0.2
+    with pytest.raises(EdgeError, match="leave a white margin"):
+        fit_edge(photographed(printed, sigma, GAUSSIAN), 64, 64, 24)
+
+
 @pytest.mark.parametrize(
     ("light", "place", "why"),
     [

@@ -1,11 +1,12 @@
 """The joint fit, on circles whose camera is known."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from service.calibration.fit import Circles, FitError, fit_constants
+from service.calibration.fit import Circles, FitError, fit_constants, odd_pictures
 from service.optics import thin_lens
 
 K_CAM, GAMMA, FOCUS = 6.0, 0.7, 1.2
@@ -58,6 +59,16 @@ def test_a_few_wrong_circles_are_shown_and_move_little() -> None:
     assert np.delete(found.is_outlier, np.s_[::25]).mean() < 0.05
 
 
+def test_a_picture_that_is_odd_is_told_from_pictures_with_some_wrong_circles() -> None:
+    some = circles(BOTH_SIDES)
+    blur = some.blur_px.copy()
+    blur[some.picture == 3] = np.hypot(blur[some.picture == 3], 2.0)
+    blur[::25] *= 2.5
+    wrong = replace(some, blur_px=blur)
+    assert odd_pictures(wrong, fit_constants(wrong, resamples=0)) == [3]
+    assert odd_pictures(some, fit_constants(some, resamples=0)) == []
+
+
 def test_one_side_is_said_and_stated_wide() -> None:
     near = (0.5, 0.55, 0.6, 0.65, 0.7)
     free = fit_constants(circles(near), resamples=40)
@@ -67,6 +78,26 @@ def test_one_side_is_said_and_stated_wide() -> None:
     assert free.k_cam_px.low < K_CAM < free.k_cam_px.high
     assert given.k_cam_px.value == pytest.approx(K_CAM, rel=0.05)
     assert given.focus_distance_m.low == given.focus_distance_m.high == pytest.approx(FOCUS)
+
+
+@pytest.mark.parametrize(("given", "off"), [(0.97, 0), (1.0, 0), (1.015, 0), (1.05, 1), (0.95, 1), (1.12, 2), (0.8, 2)])
+def test_a_focus_distance_that_the_pictures_contradict_is_said_and_one_far_off_is_an_error(
+    given: float, off: int
+) -> None:
+    some = circles(BOTH_SIDES, error=0.005 if off else 0.02)
+    said = rf"the photographs say 1\.(19|20)\d m \(1\.1\d\d to 1\.2\d\d\), not the {given * FOCUS:g} m given"
+    if off == 2:
+        with pytest.raises(FitError, match=said):
+            fit_constants(some, given * FOCUS, resamples=20)
+        return
+    warnings = fit_constants(some, given * FOCUS, resamples=20).warnings
+    assert [bool(re.match(said, warning)) for warning in warnings[:1]] == [True] * off
+    assert not any("separate" in warning for warning in warnings)
+
+
+def test_a_focus_distance_that_one_side_does_not_tell_is_not_doubted() -> None:
+    near = fit_constants(circles((0.5, 0.55, 0.6, 0.65, 0.7)), 1.3 * FOCUS, resamples=10)
+    assert not any("photographs say" in warning for warning in near.warnings)
 
 
 def test_little_defocus_is_said_and_none_is_an_error() -> None:

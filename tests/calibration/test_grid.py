@@ -1,6 +1,7 @@
 """The grid found: in the sample photographs drawn here, sharp, blurred, turned, cropped and misnamed."""
 
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -78,18 +79,77 @@ def test_a_hidden_circle_is_filled_in_and_said_so() -> None:
     assert np.abs(found.centres_px[21] - centres(TALL, matrix)[21]).max() < 1.0
 
 
+def test_the_outline_of_a_white_sheet_is_not_the_circle_in_its_middle() -> None:
+    matrix = view(SQUARE, px_per_mm=1.2)
+    low, high = (place.astype(int) for place in (centres(SQUARE, matrix)[0] - 20, centres(SQUARE, matrix)[-1] + 20))
+    table = np.full((HIGH, WIDE), 60, np.uint8)
+    sheet = np.s_[low[1] : high[1], low[0] : high[0]]
+    table[sheet] = drawn(SQUARE, matrix)[sheet]
+    found = find_grid(table, SQUARE)
+    assert found.seen.all()
+    assert np.abs(found.centres_px - centres(SQUARE, matrix)).max() < 1.0
+
+
+SAME_UPSIDE_DOWN = (
+    CircleGrid("symmetric_circles", 7, 10, 20.0, 12.0),
+    CircleGrid("symmetric_circles", 6, 6, 20.0, 12.0),
+    CircleGrid("asymmetric_circles", 10, 4, 20.0, 14.0),
+)
+
+
+def without(grid: CircleGrid, matrix: NDArray[np.float64], hidden: Sequence[int]) -> NDArray[np.uint8]:
+    """The grid drawn, some of its circles under white paper."""
+    picture = drawn(grid, matrix)
+    for x, y in centres(grid, matrix)[list(hidden)].astype(int).tolist():
+        cv2.rectangle(picture, (x - 18, y - 18), (x + 18, y + 18), 225, -1)
+    return picture
+
+
+@pytest.mark.parametrize("hidden", [(0,), (15,), (3, 8, 14, 15, 21, 27, 29)], ids=len)
+@pytest.mark.parametrize("grid", SAME_UPSIDE_DOWN, ids=lambda grid: f"{grid.kind}-{grid.rows}x{grid.columns}")
+def test_what_is_hidden_is_filled_in_where_a_sheet_looks_the_same_upside_down(
+    grid: CircleGrid, hidden: tuple[int, ...]
+) -> None:
+    matrix = view(grid, turn_deg=8)
+    found = find_grid(without(grid, matrix, hidden), grid)
+    assert np.flatnonzero(~found.seen).tolist() == list(hidden)
+    assert np.abs(found.centres_px - centres(grid, matrix)).max() < 1.0
+
+
+def test_an_outer_row_that_is_hidden_may_be_that_of_either_side() -> None:
+    grid = SAME_UPSIDE_DOWN[0]
+    with pytest.raises(GridError, match="60 of the grid's 70 circles"):
+        find_grid(without(grid, view(grid), range(60, 70)), grid)
+
+
 @pytest.mark.parametrize(
-    "wrong",
+    ("wrong", "instead"),
     [
-        CircleGrid("asymmetric_circles", 10, 4, 20.0, 14.0),
-        CircleGrid("asymmetric_circles", 4, 11, 20.0, 14.0),
-        CircleGrid("asymmetric_circles", 12, 4, 20.0, 14.0),
-        CircleGrid("symmetric_circles", 11, 4, 20.0, 14.0),
+        (CircleGrid("asymmetric_circles", 10, 4, 20.0, 14.0), "it looks like 11 rows, 4 columns: check"),
+        (CircleGrid("asymmetric_circles", 4, 11, 20.0, 14.0), "it looks like 11 rows, 4 columns: check"),
+        (
+            CircleGrid("asymmetric_circles", 12, 4, 20.0, 14.0),
+            "or the sheet has other rows and columns; it looks like 11",
+        ),
+        (CircleGrid("symmetric_circles", 11, 4, 20.0, 14.0), "11 rows, 4 columns of asymmetric_circles"),
+        (CircleGrid("symmetric_circles", 11, 8, 20.0, 14.0), "11 rows, 4 columns of asymmetric_circles"),
     ],
 )
-def test_another_pattern_than_the_one_given_is_refused(wrong: CircleGrid) -> None:
-    with pytest.raises(GridError, match="circles"):
+def test_another_pattern_than_the_one_given_is_refused_and_what_it_looks_like_is_said(
+    wrong: CircleGrid, instead: str
+) -> None:
+    with pytest.raises(GridError, match=f"circles.*{instead}"):
         find_grid(drawn(TALL, view(TALL)), wrong)
+
+
+def test_a_dot_beside_the_sheet_makes_no_row() -> None:
+    matrix = view(TALL, turn_deg=90)
+    picture = drawn(TALL, matrix)
+    x, y = (2 * centres(TALL, matrix)[36] - centres(TALL, matrix)[28]).astype(int)  # where a twelfth row would begin
+    cv2.circle(picture, (int(x), int(y)), 12, 40, -1)
+    assert find_grid(picture, TALL).seen.all()
+    with pytest.raises(GridError, match="looks like 11 rows, 4 columns"):
+        find_grid(picture, CircleGrid("asymmetric_circles", 12, 4, 20.0, 14.0))
 
 
 def test_a_mirrored_grid_of_even_rows_is_refused() -> None:
