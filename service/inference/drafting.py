@@ -97,8 +97,8 @@ def _zoom(exif: Exif) -> float:
 def _sensor(exif: Exif, width_px: int, aspect: float, warnings: list[str]) -> tuple[float | None, int | None]:
     """Pitch in µm and width in pixels of the sensor, as if the picture were all of it.
 
-    A picture that says nothing of its width in the camera may be a small copy: then its own width is no sensor's. Where
-    the sensor's width in mm is known any such pair is as good.
+    A picture that says nothing of its width in the camera may be a small copy: then its own width is no sensor's, but
+    where it says how wide a pixel is. Where the sensor's width in mm is known any such pair is as good.
     """
     sensor_width_px = exif.width_px if exif.width_px and exif.width_px >= width_px else None
     if sensor_width_px not in (None, width_px):
@@ -106,12 +106,13 @@ def _sensor(exif: Exif, width_px: int, aspect: float, warnings: list[str]) -> tu
             f"EXIF says {sensor_width_px} pixels wide and the file has {width_px}: taken as resized; a crop would "
             "make k_cam wrong"
         )
+    if sensor_width_px is None and exif.focal_plane_pitch_um:
+        sensor_width_px = width_px
+        warnings.append(f"EXIF says how wide a pixel is, not how many there are: taken as the {width_px} of the file")
     width_mm = _sensor_width_mm(exif, sensor_width_px, aspect, warnings)
     if width_mm is not None:
         sensor_width_px = sensor_width_px or width_px
-        pitch_um: float | None = 1e3 * width_mm / sensor_width_px
-    else:
-        pitch_um = None if sensor_width_px else exif.focal_plane_pitch_um
+    pitch_um = width_mm and 1e3 * width_mm / (sensor_width_px or width_px)
     # a zoom enlarges a part of the sensor to as many pixels
     return pitch_um and (round(pitch_um / _zoom(exif), 4) or None), sensor_width_px
 

@@ -119,7 +119,8 @@ def test_a_sensor_as_wide_as_its_picture_is_drafted_only_where_something_says_so
     assert (listed.lens.sensor_width_px, said(listed, "sensor_width_px is needed")) == (645, False)
     bare: dict[str, Any] = {"make": None, "model": None, "focal_length_35mm": None, "width_px": width_px}
     pitched = draft(645, 432, **bare, focal_plane_pitch_um=6.0)
-    assert (pitched.lens.pixel_pitch_um, pitched.lens.sensor_width_px) == (6.0, None)
+    assert (pitched.lens.pixel_pitch_um, pitched.lens.sensor_width_px) == (6.0, 645)
+    assert said(pitched, "not how many there are: taken as the 645 of the file")
 
 
 def test_a_file_made_small_belongs_to_the_whole_sensor() -> None:
