@@ -57,13 +57,11 @@ class Reading:
         """``photograph_size`` is (height, width). The maps are taken over and written over: they may be large.
 
         Where the side is given its hypothesis is the answer, or nothing where no far one can exist. No error is stated
-        below the floor of optics, and nothing answered of more blur than ``most_blur_px``, in pixels of the copy. By a
-        k_cam below those that the model knows errors grow as what blur tells shrinks.
+        below the floor of optics, and nothing answered of more blur than ``most_blur_px``, in pixels of the copy.
         """
         blur_px, p_near = maps["blur_px"], maps["p_near"]
         depth_m, other_m, error = maps["log_ratio_near"], maps["log_ratio_far"], maps["log_scale"]
-        focus_m = np.float32(camera.focus_distance_m)
-        temperature = np.float32(manifest.temperature * max(1.0, manifest.ranges.k_cam_px.low / camera.k_cam_px))
+        focus_m, temperature = np.float32(camera.focus_distance_m), _temperature(manifest, camera.k_cam_px)
         floor = thin_lens.depth_error(1.0, camera.focus_distance_m, camera.k_cam_px, LEAST_BLUR_ERROR_PX)
         infinitely_far_px = thin_lens.blur_from_defocus(camera.k_cam_px, camera.gamma_px)
         nearest, farthest = manifest.ranges.depth_ratio
@@ -82,8 +80,7 @@ class Reading:
             least = np.float32(floor) * answer_m
             is_known = (np.fmax(own, least) <= MAX_RELATIVE_ERROR) & (blur_px[rows] <= most_blur_px)
             is_known &= (nearest * focus_m <= answer_m) & (answer_m <= farthest * focus_m)
-            if side == "far":
-                is_known &= has_far
+            is_known &= has_far | (side != "far")
             depth_m[rows] = answer_m
             other_m[rows] = np.where(is_far, near_m, np.where(has_far, far_m, np.float32(np.nan)))
             error[rows] = np.where(is_known, np.clip(deviation, least, MOST_STATED), NO_ANSWER)
@@ -97,6 +94,11 @@ class Reading:
             scale,
             Ratio.between(photograph_size, (camera.image_height_px, camera.image_width_px), manifest.stride),
         )
+
+
+def _temperature(manifest: Manifest, k_cam_px: float) -> np.float32:
+    """What errors are multiplied by: below those k_cam that the model knows they grow as what blur tells shrinks."""
+    return np.float32(manifest.temperature * max(1.0, manifest.ranges.k_cam_px.low / k_cam_px))
 
 
 @dataclass(frozen=True, slots=True)

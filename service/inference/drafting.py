@@ -110,11 +110,11 @@ def _sensor(exif: Exif, width_px: int, aspect: float, warnings: list[str]) -> tu
         sensor_width_px = width_px
         warnings.append(f"EXIF says how wide a pixel is, not how many there are: taken as the {width_px} of the file")
     width_mm = _sensor_width_mm(exif, sensor_width_px, aspect, warnings)
-    if width_mm is not None:
-        sensor_width_px = sensor_width_px or width_px
-    pitch_um = width_mm and 1e3 * width_mm / (sensor_width_px or width_px)
+    if width_mm is None:
+        return None, sensor_width_px
+    sensor_width_px = sensor_width_px or width_px
     # a zoom enlarges a part of the sensor to as many pixels
-    return pitch_um and (round(pitch_um / _zoom(exif), 4) or None), sensor_width_px
+    return round(1e3 * width_mm / sensor_width_px / _zoom(exif), 4) or None, sensor_width_px
 
 
 def _sensor_width_mm(exif: Exif, sensor_width_px: int | None, aspect: float, warnings: list[str]) -> float | None:

@@ -125,8 +125,6 @@ class Estimator:
         area, stopwatch = read.area, request.stopwatch
         size = (area.height_px, area.width_px)
         reading, told = self._reading(request, read, clues)
-        if is_blank := _is_blank(rgb):
-            reading.error.fill(NO_ANSWER)
         if area.height_px * area.width_px > SMALL_PX:
             self._freeing.ask()  # what a large picture has taken is kept for the next one, but for a while only
         request.cancellation.check()
@@ -146,9 +144,7 @@ class Estimator:
             within = part.within(area)
             answer, blur_px = answer.cut(within), within.cells_of(blur_px, size)
         blurrier = fraction(blur_px > read.most_blur_px / reading.scale)
-        blank = ["the photograph is black or white all over: nothing is seen in it"] if is_blank else []
-        hard = _hardness(blurrier, answer.valid_fraction)
-        warnings = (*blank, *told, *self._warnings(reading, whole=part is None), *hard)
+        warnings = (*told, *self._warnings(reading, whole=part is None), *_hardness(blurrier, answer.valid_fraction))
         return replace(answer, warnings=warnings)
 
     def read(self, rgb: NDArray[np.uint8], camera: Camera, side: Side = "auto") -> Read:
@@ -167,6 +163,10 @@ class Estimator:
         """What the networks' maps, which are written over, and known depths say together, and what to know of those."""
         size = (read.area.height_px, read.area.width_px)
         reading = partial(Reading.of, read.maps, read.camera, size, self.manifest, request.side, read.most_blur_px)
+        if _is_blank(request.rgb):
+            told = reading()
+            told.error.fill(NO_ANSWER)
+            return told, ("the photograph is black or white all over: nothing is seen in it",)
         if clues is None:
             return reading(), ()
         with request.stopwatch.stage("correct"):
@@ -238,6 +238,9 @@ def _copied(camera: Camera, scale: float) -> Camera:
 
 def _is_blank(rgb: NDArray[np.uint8]) -> bool:
     """Whether a photograph is black or white all over but for its noise."""
+    some = rgb[::NOISE_PX, ::NOISE_PX].mean()
+    if BLACK <= some <= WHITE:
+        return False
     size = tuple(max(1, pixels // NOISE_PX) for pixels in rgb.shape[1::-1])
     mean, spread = cv2.meanStdDev(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA))
     return bool((mean.max() < BLACK or mean.min() > WHITE) and spread.max() < BLANK_SPREAD)

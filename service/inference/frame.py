@@ -1,11 +1,8 @@
 """Whether a photograph is a camera's frame, and the camera as that photograph has it."""
 
-from dataclasses import replace
-
 from service.errors import ImageSizeMismatch
 from service.inference.headers import Shot
 from service.inference.images import TURNS, Photograph
-from service.optics import thin_lens
 from service.optics.camera import Camera, Lens
 
 LENS_TOLERANCE = 0.05
@@ -19,7 +16,7 @@ def stored_camera_of(camera: Camera, width_px: int, height_px: int, orientation:
     """
     unturned = camera.turned(*TURNS[UNTURNS[orientation]])
     fitting = next((one for one in (camera, unturned) if one.is_same_frame(width_px, height_px)), None)
-    return fitting and _at_size(fitting, width_px, height_px)
+    return fitting and fitting.resampled(width_px, height_px)
 
 
 def camera_of(photograph: Photograph, camera: Camera) -> tuple[Camera, tuple[str, ...]]:
@@ -36,7 +33,7 @@ def camera_of(photograph: Photograph, camera: Camera) -> tuple[Camera, tuple[str
             f"The photograph has {width_px}x{height_px} pixels upright, the camera "
             f"{camera.image_width_px}x{camera.image_height_px}: send the whole frame, not a crop."
         )
-    resized = _at_size(fitting, width_px, height_px)
+    resized = fitting.resampled(width_px, height_px)
     if resized is fitting:
         return fitting, ()
     warning = (
@@ -55,12 +52,3 @@ def other_lens(shot: Shot, lens: Lens) -> tuple[str, ...]:
         return ()
     says = " ".join(form.format(round(theirs, 2)) for theirs, _, form in known)
     return (f"its EXIF says {says}, the camera is {lens.focal_length_mm:g} mm f/{lens.f_number:g}",)
-
-
-def _at_size(camera: Camera, width_px: int, height_px: int) -> Camera:
-    """The camera behind its frame at another size, in which a smaller one's pixels are as wide as any others."""
-    resized = camera.resized(width_px, height_px)
-    if width_px >= camera.image_width_px:
-        return resized
-    gamma_px = thin_lens.gamma_after_shrinking(camera.gamma_px, width_px / camera.image_width_px)
-    return replace(resized, gamma_px=gamma_px)

@@ -141,6 +141,14 @@ class Camera:
             intrinsics=scaled,
         )
 
+    def resampled(self, width_px: int, height_px: int) -> "Camera":
+        """The camera behind a copy that whatever program made: a smaller one's pixels are as wide as any others."""
+        resized = self.resized(width_px, height_px)
+        if width_px >= self.image_width_px:
+            return resized
+        gamma_px = thin_lens.gamma_after_shrinking(self.gamma_px, width_px / self.image_width_px)
+        return replace(resized, gamma_px=gamma_px)
+
     def averaged(self, width_px: int, height_px: int) -> "Camera":
         """The camera behind a copy made smaller by averaging areas, whose gamma has a pixel's box again."""
         if (width_px, height_px) == (self.image_width_px, self.image_height_px):
