@@ -13,8 +13,10 @@ from functools import cache, lru_cache
 from typing import Literal
 
 import numpy as np
-import scipy  # its parts are imported when first used: a service that calibrates nothing starts sooner
 from numpy.typing import NDArray
+from scipy.interpolate import RectBivariateSpline
+from scipy.optimize import least_squares, minimize_scalar
+from scipy.special import chndtr, ndtr
 
 from service.optics import thin_lens
 
@@ -141,9 +143,7 @@ def find_spread(edges: Sequence[EdgeFit], gamma_px: float, tick: Callable[[], No
 
     if not blurred:
         return Spread("gaussian")
-    best = scipy.optimize.minimize_scalar(
-        of_disc, bounds=SOFTNESS_BOUNDS, method="bounded", options={"xatol": SOFTNESS_STEP}
-    )
+    best = minimize_scalar(of_disc, bounds=SOFTNESS_BOUNDS, method="bounded", options={"xatol": SOFTNESS_STEP})
     is_disc = best.fun < left_over(Spread("gaussian"))
     return Spread("disc", float(best.x) * gamma_px) if is_disc else Spread("gaussian")
 
@@ -215,7 +215,7 @@ def _fitted(patch: Patch, start: Array, spread: Spread) -> EdgeFit:
     def slopes(values: Array) -> Array:
         return np.asarray(picture(values.tobytes())[1] / white)
 
-    found = scipy.optimize.least_squares(
+    found = least_squares(
         left_over,
         np.clip(start, low + 1e-6, high - 1e-6),
         jac=slopes,
@@ -329,19 +329,18 @@ def _profile(at: Array, radius: float, blur_px: float, spread: Spread) -> Array:
 def _gaussian_profile(at: Array, radius: float, sigma: float) -> Array:
     ratio = sigma / radius
     if ratio < STRAIGHT_BELOW:
-        return np.asarray(scipy.special.ndtr(-at / sigma - ratio / 2))
+        return np.asarray(ndtr(-at / sigma - ratio / 2))
     within = np.clip(at, max(-radius, -FAR_SIGMAS * sigma), FAR_SIGMAS * sigma) / sigma
     return np.asarray(_gaussian_table()(within, np.array([min(ratio, WIDEST)]))[:, 0])
 
 
 @cache
-def _gaussian_table() -> "scipy.interpolate.RectBivariateSpline":
+def _gaussian_table() -> RectBivariateSpline:
     """How much of a Gaussian at t sigmas from a circle's edge lies inside it, over t and sigma over the radius."""
     t = np.linspace(-FAR_SIGMAS, FAR_SIGMAS, 141)
     ratio = np.geomspace(0.9 * STRAIGHT_BELOW, WIDEST, 40)
     from_centre = np.maximum(1 / ratio + t[:, None], 0)
-    inside = scipy.special.chndtr(1 / ratio**2, 2, from_centre**2)
-    return scipy.interpolate.RectBivariateSpline(t, ratio, inside)
+    return RectBivariateSpline(t, ratio, chndtr(1 / ratio**2, 2, from_centre**2))
 
 
 def _disc_profile(at: Array, radius: float, spread_radius: float) -> Array:

@@ -12,8 +12,9 @@ from dataclasses import dataclass, field, fields, replace
 from functools import partial
 
 import numpy as np
-import scipy  # lazily, as in edge.py
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.special import stdtrit
 
 from service.optics import thin_lens
 
@@ -279,7 +280,7 @@ def _fitted(circles: Circles, focus_m: float | None, start: Array | None) -> Arr
 
         first = np.log(start) if start is not None else np.log(_start(circles, guess))
         first = np.clip(first[:free], low[:free] + 1e-9, high[:free] - 1e-9)
-        fit = scipy.optimize.least_squares(rest, first, bounds=(low[:free], high[:free]), loss="soft_l1", max_nfev=200)
+        fit = least_squares(rest, first, bounds=(low[:free], high[:free]), loss="soft_l1", max_nfev=200)
         constants = np.exp(np.append(fit.x, math.log(guess)) if free == 2 else fit.x)
         found.append((float(fit.cost), constants))
     return min(found, key=lambda pair: pair[0])[1]
@@ -329,7 +330,7 @@ def _widening(circles: Circles) -> float:
     """What a bootstrap over few pictures (over circles, if there is one) is too narrow by."""
     pictures = np.unique(circles.picture).size
     groups = pictures if pictures > 1 else circles.depth_m.size
-    return float(scipy.special.stdtrit(groups - 1, (1 + CONFIDENCE) / 2) / 1.96 * math.sqrt(groups / (groups - 1)))
+    return float(stdtrit(groups - 1, (1 + CONFIDENCE) / 2) / 1.96 * math.sqrt(groups / (groups - 1)))
 
 
 def _interval(value: float, drawn: Array, widen: float) -> Interval:

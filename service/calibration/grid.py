@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import scipy  # lazily, as in edge.py
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from service.calibration.target import LEAST_GAP_MM, CircleGrid, Kind
 from service.opencv import cv2
@@ -65,7 +65,7 @@ class FoundGrid:
 class _Blobs:
     places: Array
     sizes: Array
-    tree: "scipy.spatial.cKDTree"
+    tree: cKDTree
 
 
 def find_grid(grey: NDArray[np.uint8], grid: CircleGrid, check: Callable[[], None] = lambda: None) -> FoundGrid:
@@ -179,7 +179,7 @@ def _blobs(grey: NDArray[np.uint8], check: Callable[[], None]) -> _Blobs:
         raise GridError(NOTHING)
     u, v, sizes = (np.bincount(numbers, column)[often] / count[often] for column in found.T)
     places = np.stack([u, v], 1)
-    return _Blobs(places, sizes, scipy.spatial.cKDTree(places))
+    return _Blobs(places, sizes, cKDTree(places))
 
 
 def _seen_at(threshold: float, grey: NDArray[np.uint8]) -> Array:
@@ -204,7 +204,7 @@ def _continued(found: Array, last: Array) -> NDArray[np.intp]:
     """
     numbers = np.full(len(found), -1, np.intp)
     if len(last) and len(found):
-        away, near = _nearest(scipy.spatial.cKDTree(last[:, :2]), found[:, :2])
+        away, near = _nearest(cKDTree(last[:, :2]), found[:, :2])
         size, before = found[:, 2, None], last[near, 2]
         goes_on = away < np.maximum(np.maximum(size, before) / 2, LEAST_APART_PX)
         goes_on &= _is_alike(size / before)
@@ -214,7 +214,7 @@ def _continued(found: Array, last: Array) -> NDArray[np.intp]:
     return numbers
 
 
-def _nearest(tree: "scipy.spatial.cKDTree", places: Array) -> tuple[Array, NDArray[np.intp]]:
+def _nearest(tree: cKDTree, places: Array) -> tuple[Array, NDArray[np.intp]]:
     """How far the few blobs nearest to a place [..., 2] are, and which, the nearest first [..., few]."""
     away, near = tree.query(places, np.arange(1, min(NESTED, tree.n) + 1))
     return np.asarray(away, np.float64), np.asarray(near, np.intp)
