@@ -1,6 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
-# a module becomes bytecode when it is first imported and is kept: all that is installed takes as long as to install it
+# a module becomes bytecode when it is first imported, which setting up does, and is kept: all that is installed takes as
+# long as to install it
 export PYTHONDONTWRITEBYTECODE :=
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 INSTALL := $(PIP) install --no-compile --require-hashes --requirement
