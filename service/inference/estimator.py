@@ -3,7 +3,6 @@
 import weakref
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Self
 
 import numpy as np
@@ -18,6 +17,7 @@ from service.inference.later import Later
 from service.inference.pair import GraphPair, RawMaps, Side, Stopwatch
 from service.inference.part import Part
 from service.inference.resampling import Ratio
+from service.inference.surroundings import settle
 from service.inference.tiles import PIXEL_BUDGET, read_in_tiles
 from service.opencv import cv2
 from service.optics.camera import Camera
@@ -162,14 +162,19 @@ class Estimator:
     def _reading(self, request: _Request, read: Read, clues: Clues | None) -> tuple[Reading, tuple[str, ...]]:
         """What the networks' maps, which are written over, and known depths say together, and what to know of those."""
         size = (read.area.height_px, read.area.width_px)
-        reading = partial(Reading.of, read.maps, read.camera, size, self.manifest, request.side, read.most_blur_px)
+
+        def reading() -> Reading:
+            answer = Reading.of(read.maps, read.camera, size, self.manifest, request.side, read.most_blur_px)
+            settle(answer, request.side, read.stride, max(request.rgb.shape[:2]) * read.scales[0])
+            return answer
+
         if _is_blank(request.rgb):
             told = reading()
             told.error.fill(NO_ANSWER)
             return told, ("the photograph is black or white all over: nothing is seen in it",)
-        if clues is None:
-            return reading(), ()
         with request.stopwatch.stage("correct"):
+            if clues is None:
+                return reading(), ()
             likeness = clues.likeness(read)
             if request.side == "auto":
                 clues.lean(read, likeness)

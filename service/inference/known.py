@@ -16,7 +16,7 @@ from service.inference.copies import Read
 from service.inference.depth_map import MAX_RELATIVE_ERROR, MOST_STATED, Reading
 from service.inference.hypotheses import SIGMA_OF_LAPLACE
 from service.inference.layout import LEAST_DOUBT, add_odds
-from service.inference.pair import Side
+from service.inference.pair import SIDE_RANGES, Side
 from service.inference.part import Part
 from service.inference.resampling import bands
 from service.opencv import cv2, exp, log
@@ -141,7 +141,7 @@ class Clues:
         warning each where that is much. No answer leaves the side that was asked for.
         """
         depth_m, error, focus_m = reading.depth_m, reading.error, self.camera.focus_distance_m
-        low_m, high_m = {"near": (0.0, focus_m), "far": (focus_m, np.inf), "auto": (0.0, np.inf)}[self.side]
+        low_m, high_m = (ratio * focus_m for ratio in SIDE_RANGES[self.side])
         cells = [read.cell_of(point.u, point.v) for point in self.known]
 
         def off() -> Numbers:

@@ -23,6 +23,7 @@ from service.optics.camera import Camera
 
 Side = Literal["auto", "near", "far"]
 SIDE_HINTS: dict[Side, float] = {"auto": 0.0, "near": -1.0, "far": 1.0}
+SIDE_RANGES: dict[Side, tuple[float, float]] = {"auto": (0.0, np.inf), "near": (0.0, 1.0), "far": (1.0, np.inf)}  # z/s1
 BLUR_ERROR_RANGE = (0.01, 2.0)
 MAPS = ("blur_px", "blur_log_error", "log_ratio_near", "log_ratio_far", "p_near", "log_scale")
 

@@ -179,8 +179,8 @@ def test_doubt_between_depths_far_apart_is_said_and_still_an_answer(folder: Path
 
 def test_auto_follows_the_features_handed_from_graph_to_graph(estimator: Estimator) -> None:
     rgb = grey(0)
-    rgb[:, :48, 0] = 180
-    rgb[:, 48:, 1] = 180
+    rgb[:, :48, 0] = 255
+    rgb[:, 48:, 1] = 255
     answer = estimator.estimate(rgb, CAMERA)
     assert (answer.depth_m[:, :40] < 2).all()
     assert (answer.depth_m[:, 56:] > 2).all()
@@ -261,7 +261,8 @@ def test_strong_blur_is_read_on_smaller_copies(halving: Estimator, size: tuple[i
         blur_px = blur_of(brightness_for(told))
         np.testing.assert_allclose(answer.blur_px[:, columns], blur_px * width / seen_by.image_width_px, rtol=1e-4)
         x = thin_lens.relative_defocus_from_blur(blur_px, seen_by.gamma_px, seen_by.k_cam_px)
-        np.testing.assert_allclose(answer.depth_m[:, columns], thin_lens.depth_near(x, 2.0), rtol=1e-4)
+        # the other half surrounds it, and is heard a little
+        np.testing.assert_allclose(answer.depth_m[:, columns], thin_lens.depth_near(x, 2.0), rtol=2e-3)
 
 
 def test_between_two_copies_no_step_shows(halving: Estimator) -> None:

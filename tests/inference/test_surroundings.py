@@ -1,0 +1,106 @@
+"""What surrounds a pixel counts as far as the pixel's own reading is in doubt."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from service.inference.depth_map import Reading
+from service.inference.pair import Side
+from service.inference.resampling import Ratio
+from service.inference.surroundings import settle
+from service.optics.camera import Camera
+
+SIZE = (120, 160)
+STRIDE = 2
+FOCUS_M = 2.0
+CAMERA = Camera(SIZE[1] * STRIDE, SIZE[0] * STRIDE, FOCUS_M, 6.0)
+SURE, UNSURE = 0.02, 0.3
+
+Array = NDArray[np.float32]
+
+
+def read(
+    depth_m: Array | float,
+    error: Array | float,
+    other_m: Array | float = np.nan,
+    p_near: Array | float = 1.0,
+    size: tuple[int, int] = SIZE,
+) -> Reading:
+    """A reading of these maps; without ``other_m`` of near hypotheses alone."""
+
+    def everywhere(values: Array | float) -> Array:
+        return np.array(np.broadcast_to(np.asarray(values, np.float32), size))
+
+    maps = everywhere(depth_m), everywhere(other_m), everywhere(p_near), everywhere(error), everywhere(1.0)
+    return Reading(*maps, CAMERA, 1.0, Ratio(1 / STRIDE, 1 / STRIDE))
+
+
+def settled(reading: Reading, side: Side = "auto") -> Array:
+    settle(reading, side, STRIDE, SIZE[1] * STRIDE)
+    return reading.depth_m
+
+
+def floor() -> Array:
+    """A floor that comes nearer from the top of the picture to its bottom: inverse depth is linear in the row."""
+    inverse = np.linspace(1 / 1.9, 1 / 0.8, SIZE[0], dtype=np.float32)
+    return np.repeat(1 / inverse[:, np.newaxis], SIZE[1], axis=1)
+
+
+def test_what_is_surely_read_stays() -> None:
+    truth = floor()
+    np.testing.assert_allclose(settled(read(truth, SURE)), truth, rtol=0.003)
+
+
+def test_one_thing_in_doubt_is_drawn_to_the_floor_around_it() -> None:
+    truth, thing = floor(), (slice(50, 58), slice(70, 78))
+    depth_m, error = truth.copy(), np.full(SIZE, SURE, np.float32)
+    depth_m[thing] *= 1.5
+    error[thing] = UNSURE
+    off = settled(read(depth_m, error)) / truth
+    assert off[52:56, 72:76].max() < 1.22
+    assert np.abs(np.log(off[:46])).max() < 0.003
+
+
+def test_an_even_floor_in_doubt_keeps_most_of_its_slope() -> None:
+    truth = floor()
+    depth_m = settled(read(truth, UNSURE))
+    middle = slice(48, 72), slice(64, 96)
+    np.testing.assert_allclose(depth_m[middle], truth[middle], rtol=0.03)
+    assert (depth_m[8] > 1.3 * depth_m[-8]).all()
+
+
+def test_noise_of_what_is_in_doubt_grows_less() -> None:
+    coarse = np.random.default_rng(1).normal(0, UNSURE, (SIZE[0] // 4, SIZE[1] // 4))
+    noise = np.exp(coarse.repeat(4, 0).repeat(4, 1)).astype(np.float32)
+    truth = floor()
+    depth_m = settled(read(truth * noise, UNSURE))
+    assert np.abs(np.log(depth_m / truth)).mean() < 0.6 * np.abs(np.log(noise)).mean()
+
+
+@pytest.mark.parametrize(("other_m", "least_kept"), [(3.0, 0.85), (1.35, 0.0)])
+def test_the_table_says_on_which_side_its_box_is(other_m: float, least_kept: float) -> None:
+    """A box at 1.05 m before a table at 1.35 m, in doubt between that and beyond focus, or the table's own depth."""
+    box = (slice(50, 66), slice(70, 90))
+    table_m, box_m, p_near = 1.35, 1.05, 0.7
+    depth_m, other = np.full(SIZE, table_m, np.float32), np.full(SIZE, np.nan, np.float32)
+    error, near = np.full(SIZE, SURE, np.float32), np.ones(SIZE, np.float32)
+    depth_m[box], other[box], near[box] = box_m, other_m, p_near
+    error[box] = np.sqrt(0.06**2 + (1 - p_near) * np.log(other_m / box_m) ** 2)
+    answer = settled(read(depth_m, error, other, near))[box]
+    kept = np.log(answer / table_m) / np.log(box_m / table_m)
+    assert least_kept <= kept.min()
+    assert kept.max() < least_kept + 0.15 or least_kept == 0.0
+
+
+@pytest.mark.parametrize(("side", "p_near"), [("near", 1.0), ("far", 0.0)])
+def test_a_side_that_is_given_is_kept(side: Side, p_near: float) -> None:
+    rng = np.random.default_rng(2)
+    sign = -1 if side == "near" else 1
+    truth = (FOCUS_M * np.exp(sign * np.abs(rng.normal(0, 0.2, SIZE)))).astype(np.float32)
+    depth_m = settled(read(truth, UNSURE, p_near=p_near), side)
+    assert (depth_m <= FOCUS_M).all() if side == "near" else (depth_m >= FOCUS_M).all()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (3, 2), (17, 33)])
+def test_small_maps_are_settled(size: tuple[int, int]) -> None:
+    np.testing.assert_allclose(settled(read(1.2, UNSURE, size=size)), 1.2, rtol=1e-5)
