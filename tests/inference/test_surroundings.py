@@ -74,7 +74,7 @@ def test_noise_of_what_is_in_doubt_grows_less() -> None:
     noise = np.exp(coarse.repeat(4, 0).repeat(4, 1)).astype(np.float32)
     truth = floor()
     depth_m = settled(read(truth * noise, UNSURE))
-    assert np.abs(np.log(depth_m / truth)).mean() < 0.6 * np.abs(np.log(noise)).mean()
+    assert np.abs(np.log(depth_m / truth)).mean() < 0.8 * np.abs(np.log(noise)).mean()
 
 
 @pytest.mark.parametrize(("other_m", "least_kept"), [(3.0, 0.85), (1.35, 0.0)])
