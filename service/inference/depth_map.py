@@ -62,7 +62,6 @@ class Reading:
         blur_px, p_near = maps["blur_px"], maps["p_near"]
         depth_m, other_m, error = maps["log_ratio_near"], maps["log_ratio_far"], maps["log_scale"]
         focus_m, temperature = np.float32(camera.focus_distance_m), _temperature(manifest, camera.k_cam_px)
-        floor = thin_lens.depth_error(1.0, camera.focus_distance_m, camera.k_cam_px, LEAST_BLUR_ERROR_PX)
         infinitely_far_px = thin_lens.blur_from_defocus(camera.k_cam_px, camera.gamma_px)
         nearest, farthest = manifest.ranges.depth_ratio
         scale = camera.image_width_px / photograph_size[1]
@@ -77,7 +76,7 @@ class Reading:
                 np.copyto(p_near[rows], 1, where=~has_far)
             own = exp(error[rows]) * (SIGMA_OF_LAPLACE * temperature)
             answer_m, deviation, is_far = merged(near_m, far_m, p_near[rows], own)
-            least = np.float32(floor) * answer_m
+            least = least_error(answer_m, camera)
             is_known = (np.fmax(own, least) <= MAX_RELATIVE_ERROR) & (blur_px[rows] <= most_blur_px)
             is_known &= (nearest * focus_m <= answer_m) & (answer_m <= farthest * focus_m)
             is_known &= has_far | (side != "far")
@@ -94,6 +93,12 @@ class Reading:
             scale,
             Ratio.between(photograph_size, (camera.image_height_px, camera.image_width_px), manifest.stride),
         )
+
+
+def least_error(depth_m: Array, camera: Camera) -> Array:
+    """The floor of optics: no relative error below it is stated of a depth."""
+    per_metre = thin_lens.depth_error(1.0, camera.focus_distance_m, camera.k_cam_px, LEAST_BLUR_ERROR_PX)
+    return np.float32(per_metre) * depth_m
 
 
 def _temperature(manifest: Manifest, k_cam_px: float) -> np.float32:

@@ -14,7 +14,7 @@ from service.inference.copies import Read, blend
 from service.inference.depth_map import NO_ANSWER, DepthMap, Reading, all_layers, decide, fraction
 from service.inference.known import Clues, KnownDepth, around
 from service.inference.later import Later
-from service.inference.pair import GraphPair, RawMaps, Side, Stopwatch
+from service.inference.pair import SIDE_RANGES, GraphPair, RawMaps, Side, Stopwatch
 from service.inference.part import Part
 from service.inference.resampling import Ratio
 from service.inference.surroundings import settle
@@ -162,10 +162,12 @@ class Estimator:
     def _reading(self, request: _Request, read: Read, clues: Clues | None) -> tuple[Reading, tuple[str, ...]]:
         """What the networks' maps, which are written over, and known depths say together, and what to know of those."""
         size = (read.area.height_px, read.area.width_px)
+        (low, high), (nearest, farthest) = SIDE_RANGES[request.side], self.manifest.ranges.depth_ratio
+        limits_m = max(low, nearest) * read.camera.focus_distance_m, min(high, farthest) * read.camera.focus_distance_m
 
         def reading() -> Reading:
             answer = Reading.of(read.maps, read.camera, size, self.manifest, request.side, read.most_blur_px)
-            settle(answer, request.side, read.stride, max(request.rgb.shape[:2]) * read.scales[0])
+            settle(answer, limits_m, read.stride, max(request.rgb.shape[:2]) * read.scales[0])
             return answer
 
         if _is_blank(request.rgb):

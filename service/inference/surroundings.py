@@ -10,8 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from service.inference.depth_map import Reading
-from service.inference.pair import SIDE_RANGES, Side
+from service.inference.depth_map import MAX_RELATIVE_ERROR, MOST_STATED, Reading, least_error
 from service.opencv import cv2, exp, log
 
 CELLS = 8  # of the maps, each way, whose mean is one in what surrounds them
@@ -28,12 +27,13 @@ Array = NDArray[np.float32]
 Grid = NDArray[np.float64]
 
 
-def settle(reading: Reading, side: Side, stride: int, longer_px: float) -> None:
-    """Draw the reading's depth, which is written over, towards what surrounds it; it stays on a side that is given.
+def settle(reading: Reading, limits_m: tuple[float, float], stride: int, longer_px: float) -> None:
+    """Draw the reading's depth, which is written over, towards what surrounds it, within limits.
 
     ``longer_px`` is the longer side of the copy that was read, all of it where the reading is of a part. Which of both
     hypotheses is true is in doubt as far as it still is when what surrounds a pixel has been heard: of a thing that is
-    either a little before its table or far behind it, the table says which.
+    either a little before its table or far behind it, the table says which. Errors stay as they are stated, but for
+    what optics asks of the depth that is answered now.
     """
     depth_m, other_m, error = reading.depth_m, reading.other_m, reading.error
     variance = np.square(np.clip(error, LEAST_ERROR, MOST_ERROR))
@@ -55,9 +55,10 @@ def settle(reading: Reading, side: Side, stride: int, longer_px: float) -> None:
     in_doubt = np.minimum(read + doubt * gap**2, variance)
     towards = -off * in_doubt / (in_doubt + spread)
 
-    low_m, high_m = (ratio * reading.camera.focus_distance_m for ratio in SIDE_RANGES[side])
     depth_m *= exp(_enlarged(towards, FEWER, depth_m.shape))
-    np.clip(depth_m, low_m, high_m, out=depth_m)
+    np.clip(depth_m, *limits_m, out=depth_m)
+    stated = np.clip(error, least_error(depth_m, reading.camera), MOST_STATED)
+    np.copyto(error, stated, where=error <= MAX_RELATIVE_ERROR)
 
 
 def _surroundings(depth_m: Array, certainty: Array, reach: int) -> tuple[Array, Array]:

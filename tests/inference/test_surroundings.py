@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from service.inference.depth_map import Reading
-from service.inference.pair import Side
+from service.inference.depth_map import NO_ANSWER, Reading, least_error
 from service.inference.resampling import Ratio
 from service.inference.surroundings import settle
 from service.optics.camera import Camera
@@ -35,8 +34,8 @@ def read(
     return Reading(*maps, CAMERA, 1.0, Ratio(1 / STRIDE, 1 / STRIDE))
 
 
-def settled(reading: Reading, side: Side = "auto") -> Array:
-    settle(reading, side, STRIDE, SIZE[1] * STRIDE)
+def settled(reading: Reading, limits_m: tuple[float, float] = (0.0, np.inf)) -> Array:
+    settle(reading, limits_m, STRIDE, SIZE[1] * STRIDE)
     return reading.depth_m
 
 
@@ -92,13 +91,25 @@ def test_the_table_says_on_which_side_its_box_is(other_m: float, least_kept: flo
     assert kept.max() < least_kept + 0.15 or least_kept == 0.0
 
 
-@pytest.mark.parametrize(("side", "p_near"), [("near", 1.0), ("far", 0.0)])
-def test_a_side_that_is_given_is_kept(side: Side, p_near: float) -> None:
-    rng = np.random.default_rng(2)
-    sign = -1 if side == "near" else 1
-    truth = (FOCUS_M * np.exp(sign * np.abs(rng.normal(0, 0.2, SIZE)))).astype(np.float32)
-    depth_m = settled(read(truth, UNSURE, p_near=p_near), side)
-    assert (depth_m <= FOCUS_M).all() if side == "near" else (depth_m >= FOCUS_M).all()
+@pytest.mark.parametrize("limits_m", [(0.3, FOCUS_M), (FOCUS_M, 16.0)])
+def test_a_side_that_is_given_is_kept(limits_m: tuple[float, float]) -> None:
+    away = np.abs(np.random.default_rng(2).normal(0, 0.2, SIZE))
+    truth = FOCUS_M * np.exp(away if limits_m[0] == FOCUS_M else -away)
+    depth_m = settled(read(truth.astype(np.float32), UNSURE), limits_m)
+    assert limits_m[0] <= depth_m.min()
+    assert depth_m.max() <= limits_m[1]
+
+
+def test_what_is_drawn_farther_states_no_less_than_optics_allow() -> None:
+    depth_m, error = np.full(SIZE, 1.8, np.float32), np.full(SIZE, SURE, np.float32)
+    thing, unknown = (slice(50, 58), slice(70, 78)), (slice(10, 14), slice(10, 14))
+    depth_m[thing] = 1.0
+    error[thing] = 1.001 * least_error(depth_m[thing], CAMERA)
+    error[unknown] = NO_ANSWER
+    reading = read(depth_m, error)
+    assert settled(reading)[thing].max() > 1.0
+    assert (reading.error >= least_error(reading.depth_m, CAMERA)).all()
+    assert (reading.error[unknown] == NO_ANSWER).all()
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (3, 2), (17, 33)])
