@@ -227,8 +227,9 @@ def test_an_upright_phone_photograph_is_answered_upright(bench: TestClient) -> N
     response = ask(bench, png(stored, 6), format="npz")
     with np.load(io.BytesIO(response.content)) as found:
         assert found["depth_m"].shape == (96, 64)
-        np.testing.assert_allclose(found["depth_m"][:40], depth_near(120), rtol=1e-3)
-        np.testing.assert_allclose(found["depth_m"][56:], depth_near(30), rtol=1e-3)
+        # each half is heard a little in the other
+        np.testing.assert_allclose(found["depth_m"][:40], depth_near(120), rtol=2e-3)
+        np.testing.assert_allclose(found["depth_m"][56:], depth_near(30), rtol=2e-3)
         np.testing.assert_array_equal(found["K"], [[300, 0, 33], [0, 300, 40], [0, 0, 1]])
 
 
