@@ -18,7 +18,7 @@ from service.inference.hypotheses import SIGMA_OF_LAPLACE
 from service.inference.layout import LEAST_DOUBT, add_odds
 from service.inference.pair import SIDE_RANGES, Side
 from service.inference.part import Part
-from service.inference.resampling import bands
+from service.inference.resampling import bands, enlarged
 from service.opencv import cv2, exp, log
 from service.optics import thin_lens
 from service.optics.camera import Camera
@@ -149,12 +149,12 @@ class Clues:
 
         factor = np.clip(np.where(self._is_possible(), off(), 0), -MOST_ANCHORED, MOST_ANCHORED)
         size = depth_m.shape[::-1]
-        log_factor = _enlarged(_spread(factor, likeness), size)
+        log_factor = enlarged(_spread(factor, likeness), size)
         for rows in bands(depth_m.shape):
             depth_m[rows] = (depth_m[rows] * exp(log_factor[rows])).clip(low_m, high_m)
         still_off = off()
-        own_error = _enlarged(_spread(still_off**2, likeness) + TAPE_ERROR**2, size)
-        share = _enlarged(likeness.max(0) ** 2, size)
+        own_error = enlarged(_spread(still_off**2, likeness) + TAPE_ERROR**2, size)
+        share = enlarged(likeness.max(0) ** 2, size)
         for rows in bands(depth_m.shape):
             known = np.sqrt((1 - share[rows]) * error[rows] ** 2 + share[rows] * own_error[rows])
             np.copyto(error[rows], np.minimum(known, MOST_STATED), where=error[rows] <= MAX_RELATIVE_ERROR)
@@ -168,11 +168,6 @@ class Clues:
         """Which known depths are not surely on the side of focus that was not asked for."""
         other_side = {"near": -1.0, "far": 1.0, "auto": None}[self.side]
         return np.array([leaning != other_side for leaning in self.leanings])
-
-
-def _enlarged(values: Array, size: tuple[int, int]) -> Array:
-    """A map made as large as (width, height)."""
-    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 def _log_odds(p_near: Numbers) -> Numbers:

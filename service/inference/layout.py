@@ -10,7 +10,7 @@ are put together, made smaller, and asked at once. Refocused frames of three tim
 import numpy as np
 from numpy.typing import NDArray
 
-from service.inference.resampling import bands
+from service.inference.resampling import bands, enlarged
 from service.opencv import cv2, exp
 
 LEAST_DOUBT = np.float32(1e-6)
@@ -27,9 +27,9 @@ def shrunk(layout_map: Array, times: float) -> Array:
 def add_odds(p_near: Array, odds: Array, size: tuple[int, int]) -> None:
     """Add log odds [h, w] to probabilities, which are written over; theirs is the top left of a map of that size."""
     rows, columns = p_near.shape
-    enlarged = np.asarray(cv2.resize(odds, size[::-1], interpolation=cv2.INTER_LINEAR), np.float32)[:rows, :columns]
+    everywhere = enlarged(odds, size[::-1])[:rows, :columns]
     for part in bands(p_near.shape):
         kept = np.clip(p_near[part], LEAST_DOUBT, 1 - LEAST_DOUBT)
         # with o = exp(odds): p o / (p o + 1 - p)
-        kept /= kept + (1 - kept) * exp(-enlarged[part])
+        kept /= kept + (1 - kept) * exp(-everywhere[part])
         p_near[part] = kept

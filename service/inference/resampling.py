@@ -33,6 +33,11 @@ def bands(size: tuple[int, int]) -> Iterator[slice]:
     return (slice(top, min(top + rows, height)) for top in range(0, height, rows))
 
 
+def enlarged(values: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """A map made as large as (width, height), bilinear."""
+    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_LINEAR), np.float32)
+
+
 def sample(values: NDArray[np.float32], ratio: Ratio, rows: slice, width: int) -> NDArray[np.float32]:
     """The map [h, w] at some rows of a photograph so many pixels wide; its edges are continued."""
     at = (np.arange(rows.start, rows.stop) + 0.5) * ratio.rows - 0.5

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.inference.depth_map import MAX_RELATIVE_ERROR, MOST_STATED, Reading, least_error
+from service.inference.resampling import enlarged
 from service.opencv import cv2, exp, log
 
 CELLS = 8  # of the maps, each way, whose mean is one in what surrounds them
@@ -39,19 +40,17 @@ def settle(reading: Reading, limits_m: tuple[float, float], stride: int, longer_
     variance = np.square(np.clip(error, LEAST_ERROR, MOST_ERROR))
     reach = max(1, round(min(REACH * longer_px, MOST_REACH_PX) / (stride * CELLS)))
     plane, unevenness = _surroundings(depth_m, np.reciprocal(variance), reach)
-    has_other = np.isfinite(other_m)
-    maps = depth_m, np.where(has_other, other_m, depth_m), reading.p_near, variance
+    maps = depth_m, np.where(np.isfinite(other_m), other_m, depth_m), reading.p_near, variance
     own_m, other_m, p_near, variance = (_means(values, FEWER) for values in maps)
     plane, unevenness = (_enlarged(values, CELLS // FEWER, own_m.shape) for values in (plane, unevenness))
 
     off, gap = log(own_m * plane), log(other_m / own_m)
     spread = OWN_SPREAD**2 + UNEVEN_WEIGHT * unevenness
-    is_far = gap < 0
-    doubt, trust = np.where(is_far, p_near, 1 - p_near), np.where(is_far, 1 - p_near, p_near)
+    doubt = np.where(gap < 0, p_near, 1 - p_near)
     read = np.maximum(variance - doubt * gap**2, LEAST_ERROR**2)
     likelier = np.clip((off**2 - (off + gap) ** 2) / (2 * (read + spread)), -MOST_LIKELIER, MOST_LIKELIER)
-    doubt *= exp(likelier)
-    doubt /= doubt + trust
+    odds = doubt * exp(likelier)
+    doubt = odds / (odds + 1 - doubt)
     in_doubt = np.minimum(read + doubt * gap**2, variance)
     towards = -off * in_doubt / (in_doubt + spread)
 
@@ -93,5 +92,5 @@ def _means(values: Array, cells: int) -> Array:
 
 def _enlarged(values: Array, cells: int, shape: tuple[int, ...]) -> Array:
     """A map of means as one of so many cells each way, without those that were added."""
-    size = (values.shape[1] * cells, values.shape[0] * cells)
-    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_LINEAR), np.float32)[: shape[0], : shape[1]]
+    height, width = values.shape
+    return enlarged(values, (width * cells, height * cells))[: shape[0], : shape[1]]
