@@ -8,10 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from service.inference.hypotheses import doubted
 from service.inference.pair import RawMaps
 from service.inference.part import Part
 from service.inference.resampling import Ratio, bands, sample
 from service.opencv import cv2, log
+from service.optics import thin_lens
 from service.optics.camera import Camera
 
 OCTAVES = np.float32(1 / np.log(2))
@@ -37,6 +39,13 @@ class Read:
         """Pixels of the copy per pixel of the photograph."""
         camera, area = self.camera, self.area
         return Ratio.between((area.height_px, area.width_px), (camera.image_height_px, camera.image_width_px), 1)
+
+    def doubt_in_focus(self) -> None:
+        """Leave the side open, in ``p_near``, which is written over, where blur does not tell it."""
+        blur_px, p_near = self.maps["blur_px"], self.maps["p_near"]
+        for rows in bands(p_near.shape):
+            defocus = thin_lens.relative_defocus_from_blur(blur_px[rows], self.camera.gamma_px, self.camera.k_cam_px)
+            p_near[rows] = doubted(p_near[rows], defocus)
 
     def maps_from(self, inner: Part) -> RawMaps:
         """The maps, as views, from where an area within this one begins."""

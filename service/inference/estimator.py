@@ -165,6 +165,10 @@ class Estimator:
         (low, high), (nearest, farthest) = SIDE_RANGES[request.side], self.manifest.ranges.depth_ratio
         limits_m = max(low, nearest) * read.camera.focus_distance_m, min(high, farthest) * read.camera.focus_distance_m
 
+        if request.side == "auto":
+            with request.stopwatch.stage("correct"):
+                read.doubt_in_focus()
+
         def reading() -> Reading:
             answer = Reading.of(read.maps, read.camera, size, self.manifest, request.side, read.most_blur_px)
             settle(answer, limits_m, read.stride, max(request.rgb.shape[:2]) * read.scales[0])

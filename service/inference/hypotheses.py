@@ -7,8 +7,24 @@ from service.opencv import exp, log
 
 SIGMA_OF_LAPLACE = np.float32(2**0.5)
 LEAST_P_NEAR = 0.35
+LEAST_DOUBT = np.float32(1e-6)
+# x at which log odds of the side count half: chosen on the development sets, 0.05 to 0.17 do as well (docs/training.md)
+HARDLY_OUT = 0.07
 
 Array = NDArray[np.float32]
+
+
+def doubted(p_near: Array, defocus: Array) -> Array:
+    """Probabilities of being near as far as blur can tell: their log odds x^2 / (x^2 + HARDLY_OUT^2) times as large.
+
+    ``defocus`` is x, without unit, of the same shape. What is in focus shows no side; a network says one all the same,
+    by what things look like, and is too sure of it: of what a real lens shows with x below 0.03 three quarters were on
+    the other side, where it stated a quarter.
+    """
+    variance = np.square(defocus)
+    kept = np.clip(p_near, LEAST_DOUBT, 1 - LEAST_DOUBT)
+    odds = log((1 - kept) / kept) * (variance / (variance + np.float32(HARDLY_OUT**2)))
+    return np.reciprocal(1 + exp(odds))
 
 
 def merged(near_m: Array, far_m: Array, p_near: Array, error: Array) -> tuple[Array, Array, NDArray[np.bool_]]:

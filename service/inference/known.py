@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from service.inference.copies import Read
 from service.inference.depth_map import MAX_RELATIVE_ERROR, MOST_STATED, Reading
-from service.inference.hypotheses import SIGMA_OF_LAPLACE
-from service.inference.layout import LEAST_DOUBT, add_odds
+from service.inference.hypotheses import LEAST_DOUBT, SIGMA_OF_LAPLACE
+from service.inference.layout import add_odds
 from service.inference.pair import SIDE_RANGES, Side
 from service.inference.part import Part
 from service.inference.resampling import bands, enlarged

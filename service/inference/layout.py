@@ -10,10 +10,9 @@ are put together, made smaller, and asked at once. Refocused frames of three tim
 import numpy as np
 from numpy.typing import NDArray
 
+from service.inference.hypotheses import LEAST_DOUBT
 from service.inference.resampling import bands, enlarged
 from service.opencv import cv2, exp
-
-LEAST_DOUBT = np.float32(1e-6)
 
 Array = NDArray[np.float32]
 

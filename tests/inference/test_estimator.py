@@ -52,6 +52,13 @@ def test_a_level_of_blur_becomes_the_thin_lens_depth_on_either_side(estimator: E
     assert (far.p_near == 0).all()
 
 
+def test_what_is_in_focus_is_on_neither_side(estimator: Estimator) -> None:
+    sharp, blurred = brightness_for(CAMERA.gamma_px), 130
+    found = [estimator.estimate(grey(level), CAMERA).p_near for level in (sharp, blurred)]
+    np.testing.assert_allclose(found[0], 0.5, atol=0.05)
+    np.testing.assert_allclose(found[1], blurred / 255, atol=0.01)
+
+
 def test_sigma_is_root_two_times_the_laplace_scale_times_depth(estimator: Estimator) -> None:
     answer = estimator.estimate(grey(80), CAMERA, "near")
     np.testing.assert_allclose(answer.sigma_m, np.sqrt(2) * LOG_DEPTH_SCALE * answer.depth_m, rtol=1e-4)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from service.inference.hypotheses import LEAST_P_NEAR, SIGMA_OF_LAPLACE, merged
+from service.inference.hypotheses import HARDLY_OUT, LEAST_P_NEAR, SIGMA_OF_LAPLACE, doubted, merged
 
 
 def drawn_truths(near_m: float, far_m: float, p_near: float, error: float) -> NDArray[np.float64]:
@@ -57,3 +57,16 @@ def test_hypotheses_far_apart_or_at_one_place_do_not_overflow() -> None:
     assert np.isfinite(deviation).all()
     assert (near_m <= depth_m * 1.000001).all()
     assert (depth_m <= far_m * 1.000001).all()
+
+
+@pytest.mark.parametrize(("defocus", "share"), [(0.0, 0.0), (HARDLY_OUT, 0.5), (10 * HARDLY_OUT, 0.99)])
+def test_the_side_is_as_sure_as_blur_can_tell(defocus: float, share: float) -> None:
+    odds = np.array([1e-3, 0.25, 1.0, 3.0, 999.0])
+    p_near = (odds / (1 + odds)).astype(np.float32)
+    found = doubted(p_near, np.full_like(p_near, defocus)).astype(np.float64)
+    np.testing.assert_allclose(np.log(found / (1 - found)), share * np.log(odds), atol=0.002)
+
+
+def test_a_sure_side_does_not_overflow() -> None:
+    found = doubted(np.array([0, 1, 0, 1], np.float32), np.array([0, 0, 9, 9], np.float32))
+    np.testing.assert_allclose(found, [0.5, 0.5, 0, 1], atol=1e-5)
