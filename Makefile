@@ -19,9 +19,10 @@ LOCK := $(BIN)/uv pip compile --quiet --universal --generate-hashes --python-ver
 help: ## Say what each command means
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /|/' | awk -F'|' '{printf "make %-10s %s\n", $$1, $$2}'
 
-.venv/.service: pyproject.toml requirements/service.txt requirements/build.txt
+.venv/.service: pyproject.toml requirements/pip.txt requirements/service.txt requirements/build.txt
 	@echo "Setting up .venv for the service ..."
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	@$(INSTALL) requirements/pip.txt
 	@$(INSTALL) requirements/service.txt
 	@$(OURSELVES)
 	@$(BIN)/python -c "import service.app"
@@ -72,6 +73,7 @@ audit: setup ## Look the locked dependencies up among known vulnerabilities; fai
 
 lock: setup ## Write requirements/ and package-lock.json, pins kept; LOCK_FLAGS=--upgrade takes the newest
 	@echo 'pip>=25.3' | $(LOCK) --output-file requirements/service.txt --extra postgres --extra otel --extra heic --extra raw pyproject.toml -
+	@echo pip | $(LOCK) --output-file requirements/pip.txt --constraint requirements/service.txt -
 	@echo torch | $(LOCK) --output-file requirements/dev.txt --constraint requirements/service.txt --excludes /dev/stdin \
 		--extra postgres --extra otel --extra heic --extra raw --extra train --group dev pyproject.toml
 	@printf 'hatchling>=1.27,<2\neditables\n' | $(LOCK) --output-file requirements/build.txt -

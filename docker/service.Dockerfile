@@ -7,6 +7,7 @@ COPY model_export /src/model_export
 COPY migrations /src/migrations
 WORKDIR /src
 RUN python3 -m venv /opt/camind
+RUN /opt/camind/bin/python -m pip install --no-cache-dir --require-hashes -r requirements/pip.txt
 RUN /opt/camind/bin/python -m pip install --no-cache-dir --require-hashes -r requirements/service.txt
 RUN /opt/camind/bin/python -m pip install --no-cache-dir --no-deps --build-constraint requirements/build.txt .
 

@@ -43,7 +43,7 @@ def pins(lock: str) -> dict[str, set[Version]]:
     return found
 
 
-@pytest.mark.parametrize("lock", ["service.txt", "dev.txt", "build.txt"])
+@pytest.mark.parametrize("lock", ["pip.txt", "service.txt", "dev.txt", "build.txt"])
 def test_a_lock_is_pins_with_hashes_and_nothing_else(lock: str) -> None:
     assert PIN.sub("", text(lock)) == ""
     assert "make lock" in (LOCKS / lock).read_text()
@@ -74,6 +74,10 @@ def test_development_has_what_the_service_has() -> None:
     developed = pins("dev.txt")
     assert {name: developed[name] for name in pins("service.txt")} == pins("service.txt")
     assert not set(pins("service.txt")) & {"torch", "onnx", "pytest"}
+
+
+def test_what_installs_the_service_is_part_of_it() -> None:
+    assert pins("pip.txt") == {"pip": pins("service.txt")["pip"]}
 
 
 def test_what_checks_the_page_is_locked_with_hashes() -> None:
