@@ -44,8 +44,8 @@ def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 copy_into(ROOT / name, place)
         if word == "RUN":
             command = rest.replace("/opt/camind", str(venv)).replace("python3 -m venv", f"{sys.executable} -m venv")
-            # bytecode of what no test imports is not worth the time
-            environment = {**os.environ, "PIP_NO_COMPILE": "1"}
+            # bytecode of what no test imports is not worth the time; pip reads this as what `compile` is to be
+            environment = {**os.environ, "PIP_NO_COMPILE": "0"}
             subprocess.run(["sh", "-c", command], cwd=source, env=environment, check=True, capture_output=True)
     return venv
 
