@@ -104,7 +104,7 @@ def export_graphs(pair: Pair, folder: Path) -> Graphs:
     pair = folded(pair)
     height, width = EXAMPLE_SIZE
     image = torch.rand(2, 3, height, width)
-    with torch.inference_mode():
+    with torch.no_grad():  # tensors of inference mode cannot be traced but by a slower way
         seen = pair.blur(image)
     names = feature_names(len(seen.features))
     cells = (2, 1, height // pair.stride, width // pair.stride)
