@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
+from scipy.ndimage import correlate1d
 from scipy.optimize import least_squares, minimize_scalar
 from scipy.special import chndtr, ndtr
 
@@ -41,6 +42,7 @@ PIXEL_BOX = ((-math.sqrt(0.15), 5 / 18), (0.0, 8 / 18), (math.sqrt(0.15), 5 / 18
 MOST_PIXELS = 2500
 ALIKE_BELOW_PX = 0.9
 SMALL = 1e-3
+NEIGHBOURS = np.array([[0, 1, -1, 0, 0], [0, 0, 0, 1, -1]])  # of log radius and log blur: what slopes are seen from
 PRECISION = 1e-5
 SLICE_LEVEL = 0.95
 SPREAD_DISCS = 24
@@ -258,33 +260,30 @@ def _picture(values: Array, patch: Patch, spread: Spread) -> tuple[Array, Array]
     far = FAR_SIGMAS * math.exp(log_blur) + 1
     at = np.linspace(-min(float(-distance.min()) + 1, radius, far), min(float(distance.max()) + 1, far), PROFILE_POINTS)
 
-    def table(larger: float, wider: float) -> Array:
-        return _profile(at, radius * math.exp(larger), math.exp(log_blur + wider), spread)
-
-    middle = table(0, 0)
-    by_radius = (table(SMALL, 0) - table(-SMALL, 0)) / (2 * SMALL)
-    by_blur = (table(0, SMALL) - table(0, -SMALL)) / (2 * SMALL)
-    columns = np.stack([middle, np.gradient(middle, at), by_radius, by_blur], 1)
+    radii, blurs = np.exp([[log_radius], [log_blur]] + SMALL * NEIGHBOURS)
+    middle, larger, smaller, wider, narrower = _profiles(at, radii, blurs, spread)
+    by_radius, by_blur = (larger - smaller) / (2 * SMALL), (wider - narrower) / (2 * SMALL)
+    columns = np.stack([middle, np.gradient(middle, at[1] - at[0]), by_radius, by_blur], 1)
     place = np.clip((distance - at[0]) / (at[1] - at[0]), 0, PROFILE_POINTS - 1.001)
     before = place.astype(np.intp)
     part = (place - before)[:, None]
     inside, steepness, by_radius, by_blur = (columns[before] * (1 - part) + columns[before + 1] * part).T
     paper = white + (white_x * u + white_y * v) / patch.side
     dark = paper * -contrast
-    slopes = np.empty((u.size, len(PARAMETERS)))
-    slopes[:, :5] = (dark * steepness)[:, None] * by_shape
-    slopes[:, 2] += dark * by_radius
-    slopes[:, 5] = dark * by_blur
-    slopes[:, 6] = -paper * inside
+    slopes = np.empty((len(PARAMETERS), u.size))
+    slopes[:5] = dark * steepness * by_shape
+    slopes[2] += dark * by_radius
+    slopes[5] = dark * by_blur
+    slopes[6] = -paper * inside
     lit = 1 - contrast * inside
-    slopes[:, 0] -= white_x / patch.side * lit
-    slopes[:, 1] -= white_y / patch.side * lit
-    slopes[:, 7], slopes[:, 8], slopes[:, 9] = lit, lit * u / patch.side, lit * v / patch.side
-    return paper * lit, slopes
+    slopes[0] -= white_x / patch.side * lit
+    slopes[1] -= white_y / patch.side * lit
+    slopes[7], slopes[8], slopes[9] = lit, lit * u / patch.side, lit * v / patch.side
+    return paper * lit, slopes.T
 
 
 def _distance(u: Array, v: Array, radius: float, stretch: float, slant: float) -> tuple[Array, Array]:
-    """Signed distance [n] from the ellipse w' M w = 1, to first order, and its slopes by x, y, log radius and shape.
+    """Signed distance [n] from the ellipse w' M w = 1, to first order, and its slopes [5, n]: x, y, log radius, shape.
 
     With F = sqrt(w' M w), which is 1 on the ellipse, it is (F - 1) / |grad F|.
     """
@@ -294,7 +293,7 @@ def _distance(u: Array, v: Array, radius: float, stretch: float, slant: float) -
     level, length = np.sqrt(square), np.maximum(np.hypot(m_x, m_y), 1e-9)
     slope = length / level
     distance = (level - 1) / slope
-    by_shape = np.empty((u.size, 5))
+    by_shape = np.empty((5, u.size))
     changes: tuple[tuple[Array, Array | float, Array | float], ...] = (  # of w' M w, and of M w
         (-2 * m_x, -(1 + stretch) / radius**2, -slant / radius**2),
         (-2 * m_y, -slant / radius**2, -(1 - stretch) / radius**2),
@@ -305,33 +304,36 @@ def _distance(u: Array, v: Array, radius: float, stretch: float, slant: float) -
     for i, (of_square, of_x, of_y) in enumerate(changes):
         of_level = of_square / (2 * level)
         of_slope = (m_x * of_x + m_y * of_y) / (length * level) - length * of_level / square
-        by_shape[:, i] = of_level / slope - distance * of_slope / slope
+        by_shape[i] = of_level / slope - distance * of_slope / slope
     return distance, by_shape
 
 
-def _profile(at: Array, radius: float, blur_px: float, spread: Spread) -> Array:
-    """How much of a point spread at signed distance ``at`` from a circle's edge (outside positive) lies inside it."""
-    rim = min(spread.softness_px, blur_px)
-    if spread.shape == "gaussian" or rim > ALL_RIM * blur_px:
-        if blur_px > BOX_SHOWS_BELOW_PX:
-            return _gaussian_profile(at, radius, blur_px)
-        rest_px = math.sqrt(max(blur_px**2 - thin_lens.PIXEL_BOX_VARIANCE, LEAST_REST_PX**2))
-        parts = [weight * _gaussian_profile(at + place, radius, rest_px) for place, weight in PIXEL_BOX]
+def _profiles(at: Array, radius: Array, blur_px: Array, spread: Spread) -> Array:
+    """How much of point spreads at signed distance ``at`` [n] from circles' edges (outside positive) is inside: [k, n].
+
+    Those are nearly alike: the first says which law is asked.
+    """
+    radius, blur_px = radius[:, None], blur_px[:, None]
+    rim = min(spread.softness_px, float(blur_px[0, 0]))
+    if spread.shape == "gaussian" or rim > ALL_RIM * blur_px[0, 0]:
+        if blur_px[0, 0] > BOX_SHOWS_BELOW_PX:
+            return _gaussian_profiles(at, radius, blur_px)
+        rest_px = np.sqrt(np.maximum(blur_px**2 - thin_lens.PIXEL_BOX_VARIANCE, LEAST_REST_PX**2))
+        parts = [weight * _gaussian_profiles(at + place, radius, rest_px) for place, weight in PIXEL_BOX]
         return np.asarray(sum(parts))
-    hard = _disc_profile(at, radius, 2 * math.sqrt(blur_px**2 - rim**2))
+    hard = _disc_profiles(at, radius, 2 * np.sqrt(blur_px**2 - rim**2))
     step = at[1] - at[0]
     half = math.ceil(4 * rim / step)
     kernel = np.exp(-0.5 * (np.arange(-half, half + 1) * step / rim) ** 2)
-    padded = np.pad(hard, half, mode="edge")
-    return np.convolve(padded, kernel / kernel.sum(), mode="valid")
+    return np.asarray(correlate1d(hard, kernel / kernel.sum(), mode="nearest"))
 
 
-def _gaussian_profile(at: Array, radius: float, sigma: float) -> Array:
+def _gaussian_profiles(at: Array, radius: Array, sigma: Array) -> Array:
     ratio = sigma / radius
-    if ratio < STRAIGHT_BELOW:
+    if ratio[0, 0] < STRAIGHT_BELOW:
         return np.asarray(ndtr(-at / sigma - ratio / 2))
-    within = np.clip(at, max(-radius, -FAR_SIGMAS * sigma), FAR_SIGMAS * sigma) / sigma
-    return np.asarray(_gaussian_table()(within, np.array([min(ratio, WIDEST)]))[:, 0])
+    within = np.clip(at, np.maximum(-radius, -FAR_SIGMAS * sigma), FAR_SIGMAS * sigma) / sigma
+    return np.asarray(_gaussian_table().ev(within, np.minimum(ratio, WIDEST)))
 
 
 @cache
@@ -343,7 +345,7 @@ def _gaussian_table() -> RectBivariateSpline:
     return RectBivariateSpline(t, ratio, chndtr(1 / ratio**2, 2, from_centre**2))
 
 
-def _disc_profile(at: Array, radius: float, spread_radius: float) -> Array:
+def _disc_profiles(at: Array, radius: Array, spread_radius: Array) -> Array:
     """Area common to two circles, over that of the point spread."""
     apart = np.maximum(radius + at, 1e-9)
     r, s = radius, spread_radius
@@ -351,8 +353,8 @@ def _disc_profile(at: Array, radius: float, spread_radius: float) -> Array:
         a = np.arccos(np.clip((apart**2 + r**2 - s**2) / (2 * apart * r), -1, 1))
         b = np.arccos(np.clip((apart**2 + s**2 - r**2) / (2 * apart * s), -1, 1))
     common = r**2 * (a - np.sin(2 * a) / 2) + s**2 * (b - np.sin(2 * b) / 2)
-    common = np.where(apart <= abs(r - s), math.pi * min(r, s) ** 2, np.where(apart >= r + s, 0, common))
-    return common / (math.pi * s**2)
+    common = np.where(apart <= abs(r - s), math.pi * np.minimum(r, s) ** 2, np.where(apart >= r + s, 0, common))
+    return np.asarray(common / (math.pi * s**2))
 
 
 def _check(fit: EdgeFit, x_px: float, y_px: float, radius_px: float) -> None:
