@@ -500,7 +500,7 @@ def evaluate(
     ``on_progress`` hears, from any thread, of every picture, and how many sets that finishes.
     """
     # what is answered most often first, then what was named last, whose pictures are large, lest a core wait in the end
-    ordered = sorted(reversed(trials), key=lambda trial: trial.answers, reverse=True)
+    ordered = sorted(trials, key=lambda trial: trial.answers)[::-1]
     # renderings side by side, rather than each in pieces on every core
     with torch_threads(1), ThreadPoolExecutor(SETS_AT_ONCE) as pool:
         examined = pool.map(partial(_examined, models, on_progress), ordered)
