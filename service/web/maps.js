@@ -40,8 +40,9 @@ import { readNpz } from "./npy.js";
 const SAMPLES = 200_000;
 const BINS = 64;
 const LEAST_RATIO = 1.02;
-// where neither side is three times likelier than the other or so
+// where neither side is three times likelier than the other or so, and both are apart
 const EITHER = [0.3, 0.7];
+const APART = 1.25;
 const NOTHING = 0x80;
 const HATCH = 0xb4;
 const PATTERN_PX = 8;
@@ -104,7 +105,8 @@ export class DepthMaps {
 	/** @param {number} pixel */
 	isEither(pixel) {
 		const pNear = this.pNear[pixel];
-		return pNear > EITHER[0] && pNear < EITHER[1] && this.otherM[pixel] > 0;
+		const ratio = this.otherM[pixel] / this.depthM[pixel];
+		return pNear > EITHER[0] && pNear < EITHER[1] && (ratio > APART || ratio < 1 / APART);
 	}
 
 	/** @param {number} u @param {number} v @returns {Reading} */

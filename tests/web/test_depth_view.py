@@ -239,6 +239,16 @@ def test_keys_alone_read_and_measure(measured: Page, maps: Callable[..., Any]) -
     expect(measured.locator("[data-value=distance]")).to_be_visible()
 
 
+def test_dots_are_where_depth_could_as_well_be_another(measured: Page, maps: Callable[..., Any]) -> None:
+    known = maps()
+    depth_m, other_m, p_near = (known[name] for name in ("depth_m", "depth_alt_m", "p_near"))
+    is_open = (p_near > 0.3) & (p_near < 0.7)
+    is_apart = np.maximum(other_m / depth_m, depth_m / other_m) > 1.25
+    assert (is_open & ~is_apart).mean() > 0.05  # in focus, where either side is as good
+    said = measured.locator("label", has_text="Dot either side").inner_text()
+    assert float(re.findall(r"([\d.]+)\s*%", said)[0]) == pytest.approx(100 * (is_open & is_apart).mean(), abs=0.6)
+
+
 def test_colours_are_those_of_the_metres(measured: Page, maps: Callable[..., Any]) -> None:
     depth_m = maps()["depth_m"]
     near_m, far_m = 1.0, 4.0
