@@ -54,7 +54,7 @@ Map = NDArray[np.float32]
 REFERENCE = Camera(640, 480, 2.0, 3.81, 0.5, intrinsics=Intrinsics.centred(FRAME_FX_PX, 640, 480))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Case:
     """One picture to answer: ``truth_m`` is NaN where it is not scored, ``blur_px`` None where lambda is not known."""
 
@@ -242,12 +242,14 @@ class Trial:
     """A named set, and the modes (see ``evaluate.MODES``) in which its pictures are answered.
 
     They are also answered with ``factors`` on all k_cam, of which the one that the truth likes best is kept.
+    ``sheets_of`` is the camera that is known by photographs of a sheet in one of the modes.
     """
 
     name: str
     cases: CaseSource
     modes: tuple[str, ...] = ("gt",)
     factors: tuple[float, ...] = ()
+    sheets_of: Camera | None = None
 
     @property
     def answers(self) -> int:
@@ -263,15 +265,16 @@ def _enough(source: CaseSource) -> Iterator[Case]:
 def trials(data: Path, quick: bool) -> list[Trial]:
     """The sets that the data folder can serve; a missing folder is a missing set."""
     few, _, many, scenes = COUNTS[quick]
-    found = [_trial(FIXED, fixed_cases)]
+    indoor = [data / name for name in ("rgbd", "tabletop") if (data / name).is_dir()]
+    found = []
+    if len(indoor) == 2:
+        found += [_trial(f"plane {depth_m:g} m", partial(plane_cases, data, depth_m, few)) for depth_m in PLANES_M]
+    found.append(_trial(FIXED, fixed_cases))
     found += [
         _trial(f"procedural {n}", partial(procedural_cases, scenes, side)) for n, side in PROCEDURAL_SIDES.items()
     ]
     if (data / "blender" / "cameras.json").is_file():
         found.append(_trial("blender", partial(blender_cases, data / "blender", 2 * scenes), "right side"))
-    indoor = [data / name for name in ("rgbd", "tabletop") if (data / name).is_dir()]
-    if len(indoor) == 2:
-        found += [_trial(f"plane {depth_m:g} m", partial(plane_cases, data, depth_m, few)) for depth_m in PLANES_M]
     for folder in indoor:
         found += _indoor_trials(folder, quick)
     if (data / "d200").is_dir():
@@ -300,7 +303,8 @@ def _indoor_trials(folder: Path, quick: bool) -> list[Trial]:
         # a camera's sheets take as long to photograph as everything else of a set
         further = ("no k_cam", *misled) if quick else ("estimated k_cam", "no k_cam", *misled)
         count = many if camera == REFERENCE else several
-        found.append(_trial(f"{folder.name} k_cam {k_cam_px:g}", by(camera, count), *further))
+        trial = _trial(f"{folder.name} k_cam {k_cam_px:g}", by(camera, count), *further)
+        found.append(replace(trial, sheets_of=None if quick else camera))
     found.append(_trial(f"{folder.name} in focus", partial(sharp_cases, folder, few)))
     found.append(_trial(f"{folder.name} shuffled", partial(shuffled_cases, folder, few)))
     for view in VIEWS:

@@ -6,18 +6,21 @@ without an answer is scored with the median of the picture's answers, and the sh
 
 import math
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
+from functools import cache, lru_cache, partial
+from multiprocessing import get_context
 from pathlib import Path
+from queue import Queue
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model_export.calibrated import calibrated
 from model_export.cases import KNOWN_DEPTHS, UNSEEN_K_CAM_PX, Case, Trial
-from model_export.cores import torch_threads
+from model_export.cores import one_core
 from model_export.metrics import Scores, best_constant, completed, mean_scores, pooled_scores, score
+from service.cores import available_cores
 from service.inference.artifact import ModelFolder, load_model_folder
 from service.inference.cancellation import Cancellation
 from service.inference.depth_map import DepthMap, Layers
@@ -73,7 +76,6 @@ KEPT_SHARES = (1.0, 0.75, 0.5, 0.25, 0.1)
 CLEARLY_OUT = 0.25  # |x| from where on the side of focus is asked for
 SAMPLED_PIXELS = 3000
 REMEMBERED = 4
-SETS_AT_ONCE = 2
 
 Map = NDArray[np.float32]
 
@@ -343,18 +345,18 @@ class Examiner:
         return replace(far, depth_m=np.where(is_near, near.depth_m, far.depth_m), layers=layers)
 
     def _scored(self, case: Case, told: DepthMap, blur: Pixels | None = None) -> tuple[Outcome, Example]:
-        scored = np.isfinite(case.truth_m)
-        truth, depth = case.truth_m[scored], completed(told.depth_m)[scored]
-        stated = np.nan_to_num(told.sigma_m / told.depth_m, nan=np.inf)[scored]
+        scored = np.flatnonzero(np.isfinite(case.truth_m))
+        truth, depth = case.truth_m.ravel()[scored], completed(told.depth_m).ravel()[scored]
         some = slice(None, None, max(1, truth.size // SAMPLED_PIXELS))
+        sigma_m, answer_m = (values.ravel()[scored[some]] for values in (told.sigma_m, told.depth_m))
         defocus = thin_lens.relative_defocus(truth[some], case.camera.focus_distance_m)
         outcome = Outcome(
             scores=score(depth, truth),
-            constant=score(np.full_like(truth, best_constant(truth)), truth),
+            constant=_constant_scores(case),
             scored_pixels=truth.size,
-            answered=float(np.isfinite(told.depth_m[scored]).mean()),
+            answered=float(np.isfinite(told.depth_m.ravel()[scored]).mean()),
             median_error=float(abs(np.median(depth / truth) - 1)),
-            depth=Pixels(truth[some], depth[some], stated[some]),
+            depth=Pixels(truth[some], depth[some], np.nan_to_num(sigma_m / answer_m, nan=np.inf)),
             depth_blur_px=thin_lens.blur_from_defocus(defocus * case.camera.k_cam_px, case.camera.gamma_px),
             depth_defocus=defocus,
             blur=blur,
@@ -376,6 +378,13 @@ class Examiner:
         known = np.isfinite(truth)
         stated = np.exp(read.maps["blur_log_error"]) * SIGMA_OF_LAPLACE
         return Pixels(truth[known], answer[known], stated[known])
+
+
+@lru_cache(1)
+def _constant_scores(case: Case) -> Scores:
+    """What the best constant depth scores, found once for all answers to a picture in a row."""
+    truth = case.truth_m[np.isfinite(case.truth_m)]
+    return score(np.full_like(truth, best_constant(truth)), truth)
 
 
 def _sides(case: Case, told: DepthMap) -> Sides:
@@ -481,15 +490,30 @@ class _Examined:
         return self.outcomes | {f"{ORACLE_K_CAM}, x {best:g}": self.searched[best]}
 
 
-def _examined(models: Sequence[Path], on_progress: Callable[[str, int], None], trial: Trial) -> list[_Examined]:
-    examiners = [Examiner(model) for model in models]
-    found = [_Examined(trial.name) for _ in models]
-    for case in trial.cases():
-        for examiner, examined in zip(examiners, found, strict=True):
-            examined.take(examiner, case, trial)
-        on_progress(f"{trial.name}: {case.name}", 0)
-    on_progress(trial.name, 1)
-    return found
+_Scored = dict[str, list[_Examined]]  # of each set, by model
+_examiner = cache(Examiner)  # each process that examines loads a model once
+
+
+def _examined(models: Sequence[Path], said: "Queue[tuple[str, int] | None]", job: Sequence[Trial]) -> _Scored:
+    examiners = [_examiner(model) for model in models]
+    done: _Scored = {}
+    for trial in job:
+        found = done[trial.name] = [_Examined(trial.name) for _ in models]
+        for case in trial.cases():
+            for examiner, examined in zip(examiners, found, strict=True):
+                examined.take(examiner, case, trial)
+            said.put((f"{trial.name}: {case.name}", 0))
+        said.put((trial.name, 1))
+    return done
+
+
+def _jobs(trials: Sequence[Trial]) -> list[list[Trial]]:
+    """Sets that are scored one after the other, those of one camera known by its sheets together: sheets take long."""
+    jobs: dict[object, list[Trial]] = {}
+    # what was named last first, whose pictures are large; then what is answered most often, lest a core wait in the end
+    for trial in reversed(trials):
+        jobs.setdefault(trial.sheets_of or trial.name, []).append(trial)
+    return sorted(jobs.values(), key=lambda job: -sum(trial.answers for trial in job))
 
 
 def evaluate(
@@ -497,16 +521,29 @@ def evaluate(
     trials: Sequence[Trial],
     on_progress: Callable[[str, int], None] = lambda _said, _finished: None,
 ) -> list[Report]:
-    """Score model folders on the same sets of pictures, two sets at a time; a report of each.
+    """Score model folders on the same sets of pictures, a process on each core; a report of each.
 
-    ``on_progress`` hears, from any thread, of every picture, and how many sets that finishes.
+    ``on_progress`` hears, from another thread, of every picture, and how many sets that finishes. What sets are made by
+    must be what processes can be told (no lambda).
     """
-    # what is answered most often first, then what was named last, whose pictures are large, lest a core wait in the end
-    ordered = sorted(trials, key=lambda trial: trial.answers)[::-1]
-    # renderings side by side, rather than each in pieces on every core
-    with torch_threads(1), ThreadPoolExecutor(SETS_AT_ONCE) as pool:
-        examined = pool.map(partial(_examined, models, on_progress), ordered)
-        done = dict(zip((trial.name for trial in ordered), examined, strict=True))
+    context = get_context("forkserver")
+    with (
+        context.Manager() as manager,
+        ThreadPoolExecutor(1) as listener,
+        ProcessPoolExecutor(available_cores(), context, initializer=one_core) as pool,
+    ):
+        said = manager.Queue()
+
+        def listen() -> None:
+            for heard in iter(said.get, None):
+                on_progress(*heard)
+
+        listener.submit(listen)
+        try:
+            parts = pool.map(partial(_examined, models, said), _jobs(trials))
+            done = {name: found for part in parts for name, found in part.items()}
+        finally:
+            said.put(None)
     by_model = zip(models, zip(*(done[trial.name] for trial in trials), strict=True), strict=True)
     return [_reported(load_model_folder(model).manifest.name, sets) for model, sets in by_model]
 

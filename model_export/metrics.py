@@ -69,5 +69,7 @@ def completed(depth_m: Map) -> Map:
     A map without any answer is completed with 1 m.
     """
     answered = np.isfinite(depth_m)
+    if answered.all():
+        return depth_m
     filler = np.median(depth_m[answered]) if answered.any() else 1.0
     return np.where(answered, depth_m, np.float32(filler)).astype(np.float32)

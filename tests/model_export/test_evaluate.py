@@ -160,7 +160,7 @@ def test_the_right_side_is_that_of_each_pixel(oracle: Examiner) -> None:
 def test_the_oracle_finds_the_one_factor_that_all_pictures_like_best(tiny_model_dir: Path) -> None:
     wrong = replace(CAMERA, k_cam_px=CAMERA.k_cam_px / 1.25)
     pictures = [replace(case(1.0), camera=wrong) for _ in range(2)]
-    (report,) = evaluate([tiny_model_dir], [Trial("grey", lambda: iter(pictures), factors=ORACLE_FACTORS)])
+    (report,) = evaluate([tiny_model_dir], [Trial("grey", partial(iter, pictures), factors=ORACLE_FACTORS)])
     assert report.summary("grey").mean.abs_rel > 0.05
     assert report.summary("grey", "oracle k_cam, x 1.25").mean.abs_rel == pytest.approx(0, abs=1e-3)
 
@@ -171,7 +171,7 @@ def test_two_models_are_compared_on_the_same_pictures(tiny_model_dir: Path, tmp_
     shutil.copytree(tiny_model_dir, other)
     write_manifest(other, load_model_folder(other).manifest.model_copy(update={"blur_gain": 0.9}))
     pictures = [case(0.8)]
-    both = evaluate([tiny_model_dir, other], [Trial("grey", lambda: iter(pictures))])
+    both = evaluate([tiny_model_dir, other], [Trial("grey", partial(iter, pictures))])
     own, others = (report.summary("grey").mean.abs_rel for report in both)
     assert own == pytest.approx(0.25, abs=1e-3)
     assert others > own + 0.02
