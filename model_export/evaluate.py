@@ -27,7 +27,7 @@ from service.inference.depth_map import DepthMap, Layers
 from service.inference.estimator import Estimator
 from service.inference.hypotheses import SIGMA_OF_LAPLACE
 from service.inference.known import KnownDepth
-from service.inference.pair import GraphPair, RawMaps
+from service.inference.pair import GraphPair, RawMaps, Sights
 from service.optics import thin_lens
 from service.optics.camera import Camera
 
@@ -75,7 +75,6 @@ LEAST_RELIEF = 1e-3
 KEPT_SHARES = (1.0, 0.75, 0.5, 0.25, 0.1)
 CLEARLY_OUT = 0.25  # |x| from where on the side of focus is asked for
 SAMPLED_PIXELS = 3000
-REMEMBERED = 4
 
 Map = NDArray[np.float32]
 
@@ -299,16 +298,10 @@ class _RememberingPair(GraphPair):
 
     def __init__(self, folder: ModelFolder, intra_op_threads: int) -> None:
         super().__init__(folder, intra_op_threads)
-        self._seen: dict[tuple[tuple[int, ...], bytes], RawMaps] = {}
+        self._sights = Sights()
 
     def see(self, rgb: NDArray[np.uint8], cancellation: Cancellation) -> RawMaps:
-        picture = (rgb.shape, rgb.tobytes())
-        if picture not in self._seen:
-            if len(self._seen) == REMEMBERED:
-                self._seen.pop(next(iter(self._seen)))
-            self._seen[picture] = super().see(rgb, cancellation)
-        # what is read of a smaller copy is written over these
-        return {name: seen.copy() for name, seen in self._seen[picture].items()}
+        return self._sights.of(rgb, lambda: super(_RememberingPair, self).see(rgb, cancellation))
 
 
 class Examiner:

@@ -14,7 +14,7 @@ from service.inference.copies import Read, blend
 from service.inference.depth_map import NO_ANSWER, DepthMap, Reading, all_layers, decide, fraction
 from service.inference.known import Clues, KnownDepth, around
 from service.inference.later import Later
-from service.inference.pair import SIDE_RANGES, GraphPair, RawMaps, Side, Stopwatch
+from service.inference.pair import SIDE_RANGES, GraphPair, RawMaps, Side, Sights, Stopwatch
 from service.inference.part import Part
 from service.inference.resampling import Ratio
 from service.inference.surroundings import settle
@@ -59,6 +59,7 @@ class _Request:
     cancellation: Cancellation = field(default_factory=Cancellation)
     part: Part | None = None
     stopwatch: Stopwatch = field(default_factory=Stopwatch)
+    sights: Sights | None = None  # of small copies, where they are read for more than one camera
 
     def area(self, scale: float, multiple: int) -> Part:
         """What a copy of this scale shows: the photograph, or the part and what the copy needs around it.
@@ -118,9 +119,11 @@ class Estimator:
         if (width, height) != (camera.image_width_px, camera.image_height_px):
             raise ValueError(f"the camera must be that of a {width}x{height} image: resize it first")
         request = _Request(rgb, camera, side, cancellation or Cancellation(), part)
-        clues = self._clues(request, known)
-        if clues is not None:
-            request = replace(request, camera=clues.camera, part=part and around(known, part))
+        clues = None
+        if known:
+            request = replace(request, part=part and around(known, part), sights=Sights())
+            clues = self._clues(request, known)
+            request = replace(request, camera=clues.camera)
         read = self._read_copies(request, self._base_scale(request.camera))
         area, stopwatch = read.area, request.stopwatch
         size = (area.height_px, area.width_px)
@@ -151,11 +154,12 @@ class Estimator:
         """What the networks answer, before it is decided what that means: for measuring them."""
         return self._read_copies(_Request(rgb, camera, side), self._base_scale(camera))
 
-    def _clues(self, request: _Request, known: Sequence[KnownDepth]) -> Clues | None:
-        """What known depths tell, None where there are none."""
-        if not known:
-            return None
-        read = self._read_copies(replace(request, side="auto", part=around(known)), self._base_scale(request.camera))
+    def _clues(self, request: _Request, known: Sequence[KnownDepth]) -> Clues:
+        """What known depths tell, of what a small copy shows anyway, or of what is around them on a large one."""
+        scale = self._base_scale(request.camera)
+        is_small = scale**2 * request.rgb.shape[0] * request.rgb.shape[1] <= SMALL_PX
+        part = request.part if is_small else around(known)
+        read = self._read_copies(replace(request, side="auto", part=part), scale)
         with request.stopwatch.stage("correct"):
             return Clues.of(read, request.camera, request.side, known)
 
@@ -219,9 +223,10 @@ class Estimator:
         whole_px = max(request.rgb.shape[:2]) * scale
         is_wide = whole_px > WIDE_PX
         side, cancellation, stopwatch = request.side, request.cancellation, request.stopwatch
+        sights = request.sights if size[0] * size[1] <= SMALL_PX else None
         maps = read_in_tiles(
             np.asarray(copy, np.uint8),
-            lambda tile: self._pair.read(tile, working, side, cancellation, stopwatch, is_tile=is_wide),
+            lambda tile: self._pair.read(tile, working, side, cancellation, stopwatch, is_tile=is_wide, sights=sights),
             multiple=self.manifest.multiple,
             stride=self.manifest.stride,
             pixel_budget=self._pixel_budget,

@@ -5,7 +5,7 @@ distance, nothing decided yet.
 """
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Literal
@@ -26,6 +26,8 @@ SIDE_HINTS: dict[Side, float] = {"auto": 0.0, "near": -1.0, "far": 1.0}
 SIDE_RANGES: dict[Side, tuple[float, float]] = {"auto": (0.0, np.inf), "near": (0.0, 1.0), "far": (1.0, np.inf)}  # z/s1
 BLUR_ERROR_RANGE = (0.01, 2.0)
 MAPS = ("blur_px", "blur_log_error", "log_ratio_near", "log_ratio_far", "p_near", "log_scale")
+
+REMEMBERED = 4
 
 RawMaps = dict[str, NDArray[np.float32]]
 
@@ -49,6 +51,22 @@ class Stopwatch:
             self.elapsed_ms[name] = self.elapsed_ms.get(name, 0.0) + spent
 
 
+class Sights:
+    """What the blur graph said of the last few pictures, to be corrected for one camera after the other."""
+
+    def __init__(self) -> None:
+        self._seen: dict[tuple[tuple[int, ...], bytes], RawMaps] = {}
+
+    def of(self, rgb: NDArray[np.uint8], see: Callable[[], RawMaps]) -> RawMaps:
+        """Of a picture, which is seen if it was not; its maps may be written over."""
+        picture = (rgb.shape, rgb.tobytes())
+        if picture not in self._seen:
+            if len(self._seen) == REMEMBERED:
+                self._seen.pop(next(iter(self._seen)))
+            self._seen[picture] = see()
+        return {name: values.copy() if name in MAPS else values for name, values in self._seen[picture].items()}
+
+
 class GraphPair:
     """blur.onnx and depth.onnx, and layout.onnx where there is one, loaded; holds no state between calls."""
 
@@ -70,14 +88,16 @@ class GraphPair:
         stopwatch: Stopwatch,
         *,
         is_tile: bool = False,
+        sights: Sights | None = None,
     ) -> RawMaps:
         """Raw maps, each float32 [ceil(h/stride), ceil(w/stride)], of an image uint8 [h, w, 3].
 
         ``camera`` is at the scale of the image, of which this may be a part: a crop changes no blur. Of a tile
         ``p_near`` is without what its own layout says: ``lay_out`` adds the whole's, of the map [c,h,w] that is there.
+        What ``sights`` has is not seen again.
         """
         with stopwatch.stage("blur"):
-            seen = self.see(rgb, cancellation)
+            seen = sights.of(rgb, lambda: self.see(rgb, cancellation)) if sights else self.see(rgb, cancellation)
         with stopwatch.stage("correct"):
             feeds = _corrected(seen, camera, side)
         with stopwatch.stage("depth"):

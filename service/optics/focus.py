@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from service.optics import thin_lens
@@ -18,9 +18,9 @@ SIDE_ERROR = 0.05
 # be it what was told
 TAIL = 2.5
 FARTHEST_OFF = 2.5
-# candidates over what was told
-FOCUS_RATIOS = tuple(FARTHEST_OFF ** (step / 100) for step in range(-100, 101))
-GAMMA_RATIOS = tuple(FARTHEST_OFF ** (step / 6) for step in range(-6, 7))
+# candidates over what was told, that itself first: what is farther off than they are need not be looked at
+FOCUS_RATIOS = tuple(FARTHEST_OFF ** (step / 100) for step in sorted(range(-100, 101), key=abs))
+GAMMA_RATIOS = tuple(FARTHEST_OFF ** (step / 6) for step in sorted(range(-6, 7), key=abs))
 LEAST_BLUR_PX = 0.1
 CONFIDENCE_95 = 1.92  # half of the 95 % quantile of chi squared with one degree of freedom
 
@@ -32,6 +32,11 @@ class Sighting:
     depth_m: float
     blur_px: float
     error: float
+
+    def deviation(self, shown_px: float) -> float:
+        """By how many standard deviations of its reading its blur is off what a camera shows, in ln lambda, signed."""
+        ratio = max(self.blur_px, LEAST_BLUR_PX) / max(shown_px, LEAST_BLUR_PX)
+        return math.log(ratio) / max(self.error, READING_ERROR)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,34 +65,40 @@ def fit_focus(camera: Camera, sightings: Sequence[Sighting], is_near: bool | Non
         raise ValueError("a focus distance is fitted to one known depth or more")
     nearest_m = camera.focal_length_m or 0.0
     distances_m = [m for m in (camera.focus_distance_m * ratio for ratio in FOCUS_RATIOS) if m > nearest_m]
-    candidates = [each for focus_m in distances_m for each in _candidates(camera, focus_m, sightings, is_near)]
-    best = min(candidates, key=lambda each: each.loss)
-    likely_m = [each.focus_distance_m for each in candidates if each.loss <= best.loss + CONFIDENCE_95]
-    return FocusFit(best.focus_distance_m, likely_m[0], likely_m[-1], best.gamma_ratio, best.deviations)
+    best, possible = _Candidate(camera.focus_distance_m, 1.0, math.inf), []
+    for focus_m in distances_m:
+        for candidate in _candidates(camera, focus_m, sightings, is_near, best.loss + CONFIDENCE_95):
+            possible.append(candidate)
+            best = min(best, candidate, key=lambda each: each.loss)
+    likely_m = [each.focus_distance_m for each in possible if each.loss <= best.loss + CONFIDENCE_95]
+    fitted = replace(camera.focused_at(best.focus_distance_m), gamma_px=camera.gamma_px * best.gamma_ratio)
+    deviations = tuple(abs(seen.deviation(fitted.blur_px(seen.depth_m))) for seen in sightings)
+    return FocusFit(best.focus_distance_m, min(likely_m), max(likely_m), best.gamma_ratio, deviations)
 
 
 class _Candidate(NamedTuple):
     focus_distance_m: float
     gamma_ratio: float
-    deviations: tuple[float, ...]
     loss: float
 
 
 def _candidates(
-    camera: Camera, focus_m: float, sightings: Sequence[Sighting], is_near: bool | None
+    camera: Camera, focus_m: float, sightings: Sequence[Sighting], is_near: bool | None, most: float
 ) -> Iterator[_Candidate]:
-    """The camera focused there with every gamma."""
+    """The camera focused there with every gamma, but for those with which more than ``most`` is lost."""
     k_cam_px = camera.focused_at(focus_m).k_cam_px
-    defocus_px = [thin_lens.defocus_at_depth(seen.depth_m, focus_m, k_cam_px) for seen in sightings]
+    seen = [(each.deviation, thin_lens.defocus_at_depth(each.depth_m, focus_m, k_cam_px)) for each in sightings]
     off_focus = math.log(focus_m / camera.focus_distance_m) / TOLD_ERROR
-    off_sides = [_off_side(seen.depth_m, focus_m, is_near) for seen in sightings]
+    lost = _loss(off_focus) + sum(_loss(_off_side(each.depth_m, focus_m, is_near)) for each in sightings)
     for ratio in GAMMA_RATIOS:
-        shown_px = (thin_lens.blur_from_defocus(sigma, camera.gamma_px * ratio) for sigma in defocus_px)
-        deviations = tuple(map(_deviation, sightings, shown_px))
-        off_gamma = math.log(ratio) / TOLD_GAMMA_ERROR
-        yield _Candidate(
-            focus_m, ratio, deviations, sum(map(_loss, (off_focus, *off_sides, *deviations))) + off_gamma**2 / 2
-        )
+        gamma_px, off_gamma = camera.gamma_px * ratio, math.log(ratio) / TOLD_GAMMA_ERROR
+        loss = lost + off_gamma**2 / 2
+        for deviation, sigma_px in seen:
+            if loss > most:
+                break
+            loss += _loss(deviation(thin_lens.blur_from_defocus(sigma_px, gamma_px)))
+        if loss <= most:
+            yield _Candidate(focus_m, ratio, loss)
 
 
 def _off_side(depth_m: float, focus_m: float, is_near: bool | None) -> float:
@@ -98,9 +109,3 @@ def _off_side(depth_m: float, focus_m: float, is_near: bool | None) -> float:
 
 def _loss(deviations: float) -> float:
     return TAIL**2 / 2 * math.log1p((deviations / TAIL) ** 2)
-
-
-def _deviation(seen: Sighting, shown_px: float) -> float:
-    """By how many standard deviations of its reading a blur is off what the camera shows, in ln lambda."""
-    ratio = max(seen.blur_px, LEAST_BLUR_PX) / max(shown_px, LEAST_BLUR_PX)
-    return abs(math.log(ratio)) / max(seen.error, READING_ERROR)

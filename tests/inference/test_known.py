@@ -8,9 +8,10 @@ import pytest
 from numpy.typing import NDArray
 
 from service.inference.artifact import load_model_folder
+from service.inference.cancellation import Cancellation
 from service.inference.estimator import Estimator
 from service.inference.known import KnownDepth
-from service.inference.pair import Side
+from service.inference.pair import GraphPair, RawMaps, Side
 from service.inference.part import Part
 from service.optics.camera import Camera
 from tests.inference.oracle_pair import brightness_for, build_oracle_pair
@@ -181,6 +182,21 @@ def test_a_photograph_that_is_read_on_a_smaller_copy_has_the_same_answer(estimat
     assert answer.scales[0] == pytest.approx(0.5, abs=0.05)
     assert answer.camera.focus_distance_m == pytest.approx(1.8, rel=0.03)
     assert answer.depth_m[120, 60] == pytest.approx(1.3, rel=0.03)
+
+
+@pytest.mark.parametrize("part", [None, Part(192, 128, 384, 256)])
+def test_what_one_camera_was_asked_of_is_not_seen_again_for_the_other(
+    estimator: Estimator, monkeypatch: pytest.MonkeyPatch, part: Part | None
+) -> None:
+    see, seen = GraphPair.see, []
+
+    def noting(pair: GraphPair, rgb: NDArray[np.uint8], cancellation: Cancellation) -> RawMaps:
+        seen.append(rgb.shape)
+        return see(pair, rgb, cancellation)
+
+    monkeypatch.setattr(GraphPair, "see", noting)
+    estimator.estimate(photograph(), TOLD, part=part, known=KNOWN)
+    assert len(seen) == 1
 
 
 @pytest.mark.parametrize("at", [(-0.5, -0.5), (383.4, 255.4), (0, 255), (383, 0)])
