@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -178,6 +179,18 @@ def test_two_models_are_compared_on_the_same_pictures(tiny_model_dir: Path, tmp_
     head, (row, worst) = beside(*both)
     assert row[:4] == ["grey", f"{own:.3f}", f"{others:.3f}", f"{others / own:.3f}"]
     assert worst[head.index("times")] == row[3]
+
+
+def _no_picture() -> Iterator[Case]:
+    raise OSError("no such picture")
+
+
+def test_a_picture_that_cannot_be_read_ends_the_evaluation_and_is_told_of(tiny_model_dir: Path) -> None:
+    heard: list[tuple[str, int]] = []
+    sets = [Trial("grey", partial(iter, [case(1.0)])), Trial("missing", _no_picture)]
+    with pytest.raises(OSError, match="no such picture"):
+        evaluate([tiny_model_dir], sets, lambda said, finished: heard.append((said, finished)))
+    assert ("missing", 1) not in heard
 
 
 def test_certainty_and_blur_are_scored_where_they_are_known(oracle: Examiner) -> None:
