@@ -118,12 +118,7 @@ class Estimator:
         height, width = rgb.shape[:2]
         if (width, height) != (camera.image_width_px, camera.image_height_px):
             raise ValueError(f"the camera must be that of a {width}x{height} image: resize it first")
-        request = _Request(rgb, camera, side, cancellation or Cancellation(), part)
-        clues = None
-        if known:
-            request = replace(request, part=part and around(known, part), sights=Sights())
-            clues = self._clues(request, known)
-            request = replace(request, camera=clues.camera)
+        request, clues = self._heard(_Request(rgb, camera, side, cancellation or Cancellation(), part), known)
         read = self._read_copies(request, self._base_scale(request.camera))
         area, stopwatch = read.area, request.stopwatch
         size = (area.height_px, area.width_px)
@@ -154,14 +149,21 @@ class Estimator:
         """What the networks answer, before it is decided what that means: for measuring them."""
         return self._read_copies(_Request(rgb, camera, side), self._base_scale(camera))
 
-    def _clues(self, request: _Request, known: Sequence[KnownDepth]) -> Clues:
-        """What known depths tell, of what a small copy shows anyway, or of what is around them on a large one."""
+    def _heard(self, request: _Request, known: Sequence[KnownDepth]) -> tuple[_Request, Clues | None]:
+        """The request by the camera that known depths tell, and what else they do, of all that a small copy shows.
+
+        Of a large one they are read with what is around them alone.
+        """
+        if not known:
+            return request, None
+        request = replace(request, part=request.part and around(known, request.part), sights=Sights())
         scale = self._base_scale(request.camera)
         is_small = scale**2 * request.rgb.shape[0] * request.rgb.shape[1] <= SMALL_PX
         part = request.part if is_small else around(known)
         read = self._read_copies(replace(request, side="auto", part=part), scale)
         with request.stopwatch.stage("correct"):
-            return Clues.of(read, request.camera, request.side, known)
+            clues = Clues.of(read, request.camera, request.side, known)
+        return replace(request, camera=clues.camera), clues
 
     def _reading(self, request: _Request, read: Read, clues: Clues | None) -> tuple[Reading, tuple[str, ...]]:
         """What the networks' maps, which are written over, and known depths say together, and what to know of those."""
