@@ -14,6 +14,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from service.config import Settings, SettingsError, load_settings
 from service.errors import CamindError
+from service.memory import end_uncollected, lasting
 from service.principal import EVERYDAY, LOCAL, SCOPES
 
 GROUP = "camind.commands"
@@ -40,6 +41,7 @@ def main() -> None:
     if wanted not in own:
         for entry_point in entry_points(group=GROUP):
             _add_commands(entry_point)
+    end_uncollected()
     app()
 
 
@@ -56,9 +58,10 @@ def serve(
     for that; 1 where it cannot start (the address, the model, the database); 2 for a wrong setting.
     """
     settings = _settings(host=host, port=port, model_dir=model)
-    from service import logs, server
-    from service.app import create_app
-    from service.inference.artifact import load_model_folder
+    with lasting():
+        from service import logs, server
+        from service.app import create_app
+        from service.inference.artifact import load_model_folder
 
     logs.configure(settings.log_level, settings.log_format)
     with _plain_failures():
