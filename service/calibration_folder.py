@@ -10,9 +10,8 @@ from rich.table import Table
 from service.calibration.calibrate import Picture, Task, calibrate
 from service.calibration.fit import Interval
 from service.calibration.report import PictureReport, Report, Role
-from service.inference.images import ImageLimits, read_stored_frame
+from service.inference.images import SUFFIXES, ImageLimits, photographs_in, read_stored_frame
 
-SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic", ".dng"})
 REPORT = TypeAdapter(Report)
 
 
@@ -24,14 +23,10 @@ def pictures_in(folder: Path, limits: ImageLimits) -> list[Picture]:
     roles: dict[Role, Path] = {"focused": folder / "focused", "defocused": folder / "defocused"}
     if not any(place.is_dir() for place in roles.values()):
         roles = {"defocused": folder}
-    pictures = [_picture(path, role, limits) for role, place in roles.items() for path in _photographs(place)]
+    pictures = [_picture(path, role, limits) for role, place in roles.items() for path in photographs_in(place)]
     if not any(picture.role == "defocused" for picture in pictures):
         raise ValueError(f"no photographs in {roles['defocused']}: {', '.join(sorted(SUFFIXES))} are read")
     return pictures
-
-
-def _photographs(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)
 
 
 def _picture(path: Path, role: Role, limits: ImageLimits) -> Picture:

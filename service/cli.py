@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from importlib.metadata import EntryPoint, entry_points, version
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from sqlalchemy import Engine
@@ -16,6 +16,9 @@ from service.config import Settings, SettingsError, load_settings
 from service.errors import CamindError
 from service.memory import end_uncollected, lasting
 from service.principal import EVERYDAY, LOCAL, SCOPES
+
+if TYPE_CHECKING:
+    from service.storage.cameras import CameraRecord
 
 GROUP = "camind.commands"
 WRONG_USE = 2
@@ -210,6 +213,48 @@ def calibrate(
         typer.echo(f"stored as {record.name}, revision {record.revision}")
 
 
+@app.command()
+def depth(
+    photographs: Annotated[list[Path], typer.Argument(help="Photographs, or folders of them", exists=True)],
+    camera: Annotated[str, typer.Option(help="Name of the camera that took them")],
+    out: Annotated[Path, typer.Option(help="Folder to write to", file_okay=False)] = Path("depth"),
+    formats: Annotated[
+        list[str] | None,
+        typer.Option("--format", help="png, npy, npz, tiff, ply, preview or json; may be repeated. [default: png]"),
+    ] = None,
+    side: Literal["auto", "near", "far"] = "auto",
+    focus_distance_m: Annotated[float | None, typer.Option(help="Theirs, if not the camera's")] = None,
+    at: Annotated[list[str] | None, typer.Option(help="Pixel u,v to read; may be repeated")] = None,
+    known: Annotated[list[str] | None, typer.Option(help="Known depth u,v,depth_m; may be repeated")] = None,
+    roi: Annotated[str | None, typer.Option(help="Part u0,v0,u1,v1 to answer alone")] = None,
+    only_missing: Annotated[bool, typer.Option("--only-missing", help="Leave out what is there already")] = False,
+    model: Annotated[Path | None, typer.Option(help="Model folder. [default: the shipped model]")] = None,
+    owner: Annotated[str, typer.Option(help=OWNER_HELP)] = LOCAL,
+) -> None:
+    """Photographs to depth, without a service: what POST /depth answers, into files.
+
+    Exit codes: 0; 1 where one of them has no depth, 2 for wrong options.
+    """
+    settings, formats = _settings(model_dir=model), formats or ["png"]
+    with lasting():
+        from service.depth_folder import Errand, depth_folder, query_of
+        from service.inference.images import ImageLimits
+        from service.storage.cameras import Cameras
+
+    asked = {"side": side, "focus_distance_m": focus_distance_m, "at": at or (), "known": known or (), "roi": roi}
+    try:
+        query = query_of(camera, asked, formats)
+        with _plain_failures():
+            with _ready_engine() as engine:
+                record = Cameras(engine, owner).get(camera)
+            errand = Errand(record, query, formats, ImageLimits.of(settings), out)
+            failed = depth_folder(photographs, errand, settings, is_missing_only=only_missing)
+    except ValueError as exc:
+        raise _failure(str(exc), WRONG_USE) from exc
+    if failed:
+        raise typer.Exit(1)
+
+
 @app.command(name="version")
 def print_version() -> None:
     """Print the version."""
@@ -231,23 +276,50 @@ def _seed(engine: Engine, owner: str) -> list[str]:
     return seed(Cameras(engine, owner))
 
 
+@cameras_app.command(name="add")
+def add_camera(
+    file: Annotated[typer.FileBinaryRead, typer.Argument(help="JSON as POST /cameras takes it; - for standard input")],
+    owner: Annotated[str, typer.Option(help=OWNER_HELP)] = LOCAL,
+) -> None:
+    """Store a new camera, known by its k_cam and gamma or by its lens specs."""
+    import json
+
+    from pydantic import ValidationError
+
+    from service.api.problems import invalid_model
+    from service.api.schemas import CameraCreate
+    from service.storage.cameras import Cameras
+
+    with _plain_failures():
+        try:
+            body = CameraCreate.model_validate(json.load(file))
+        except ValidationError as exc:
+            raise _failure(str(invalid_model(exc, "body")), WRONG_USE) from exc
+        except ValueError as exc:
+            raise _failure(f"{file.name} is no JSON: {exc}", WRONG_USE) from exc
+        with _ready_engine() as engine:
+            record = Cameras(engine, owner).add(body.to_draft(body.name))
+    typer.echo(_line_of(record))
+
+
 @cameras_app.command(name="list")
 def list_cameras(owner: Annotated[str, typer.Option(help=OWNER_HELP)] = LOCAL) -> None:
     """Print name, revision, k_cam, focus distance and image size, a camera a line."""
-    from service.storage.cameras import CameraRecord, Cameras
-
-    def line(record: CameraRecord) -> str:
-        camera = record.camera
-        size = f"{camera.image_width_px}x{camera.image_height_px}"
-        return f"{record.name}\tr{record.revision}\t{camera.k_cam_px:.4g} px\t{camera.focus_distance_m:g} m\t{size}"
+    from service.storage.cameras import Cameras
 
     with _plain_failures(), _ready_engine() as engine:
         cameras, after, has_more = Cameras(engine, owner), None, True
         while has_more:
             records, has_more = cameras.page(100, after)
             for record in records:
-                typer.echo(line(record))
+                typer.echo(_line_of(record))
             after = records[-1].name if records else None
+
+
+def _line_of(record: "CameraRecord") -> str:
+    camera = record.camera
+    size = f"{camera.image_width_px}x{camera.image_height_px}"
+    return f"{record.name}\tr{record.revision}\t{camera.k_cam_px:.4g} px\t{camera.focus_distance_m:g} m\t{size}"
 
 
 @keys_app.command(name="create")

@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, ValidationError
 from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
@@ -168,6 +168,11 @@ def invalid_request(faults: Sequence[Mapping[str, Any]]) -> BadRequest:
     first = fields[0]
     where = first.pointer.removeprefix("#").strip("/").replace("/", ".")
     return BadRequest(f"{where}: {first.detail}" if where else first.detail, errors=fields)
+
+
+def invalid_model(exc: ValidationError, source: str) -> BadRequest:
+    """The same of a model that no request brought: ``source`` is where its fields are from, ``body`` for JSON."""
+    return invalid_request([{**fault, "loc": (source, *fault["loc"])} for fault in exc.errors()])
 
 
 def _pointer(fault: Mapping[str, Any]) -> str:

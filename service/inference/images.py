@@ -6,6 +6,7 @@ decoded in a process of their own.
 """
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -34,6 +35,11 @@ MEDIA_TYPES: dict[str, Kind] = {
 ALIASES: dict[str, Kind] = {"image/jpg": "jpeg", "image/pjpeg": "jpeg", "image/x-png": "png"}
 CURL_S_OWN = "application/x-www-form-urlencoded"
 UNDECLARED = frozenset({"", "application/octet-stream", "image/*"})
+
+# how files of these kinds end
+SUFFIXES = frozenset(
+    {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic", ".heif", ".dng", ".cr2", ".nef", ".arw"}
+)
 
 # (transposed, flipped left-right, flipped top-bottom), in this order, by EXIF orientation
 TURNS: dict[int, tuple[bool, bool, bool]] = {
@@ -83,6 +89,11 @@ class Photograph:
     @property
     def height_px(self) -> int:
         return int(self.rgb.shape[0])
+
+
+def photographs_in(folder: Path) -> list[Path]:
+    """The files of a folder that end as photographs do, by name."""
+    return sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)
 
 
 def read_photograph(data: bytes, media_type: str | None = None, limits: ImageLimits | None = None) -> Photograph:

@@ -1,0 +1,115 @@
+"""A photograph in, its depth encoded: the work of ``POST /depth`` and of ``camind depth``, all of it in one thread."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+from service.api.depth_schemas import DepthQuery, DepthRead, PointRead, SpreadRead
+from service.api.uploads import Upload
+from service.errors import BadRequest, FieldProblem
+from service.inference.cancellation import Cancellation
+from service.inference.depth_map import DepthMap
+from service.inference.encode import ENCODERS, MEDIA_TYPES, Encoded, pixel_at, read_point, spread_of
+from service.inference.estimator import Estimator
+from service.inference.frame import camera_of, other_lens
+from service.inference.images import ImageLimits, read_photograph
+from service.inference.pair import Stopwatch
+from service.inference.part import Part
+from service.optics.camera import Camera
+from service.storage.cameras import CameraRecord
+
+JSON = "json"
+FORMAT_TYPES = {**MEDIA_TYPES, JSON: "application/json"}
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """Everything the work needs, so that it touches neither request nor database."""
+
+    upload: Upload
+    record: CameraRecord
+    camera: Camera
+    query: DepthQuery
+    formats: Sequence[str]
+    limits: ImageLimits
+    warnings: tuple[str, ...]
+
+    @classmethod
+    def of(
+        cls, upload: Upload, record: CameraRecord, query: DepthQuery, formats: Sequence[str], limits: ImageLimits
+    ) -> Self:
+        """By the camera as this shot was focused; raises ``BadRequest`` where it cannot be focused so."""
+        camera, warnings = _focused(record.draft.with_focal_length, query.focus_distance_m)
+        return cls(upload, record, camera, query, formats, limits, warnings)
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The map in the forms that were ordered, the camera it is by, what is worth a warning, milliseconds by stage."""
+
+    encoded: tuple[Encoded, ...]
+    camera: Camera
+    warnings: tuple[str, ...]
+    timings_ms: Mapping[str, float]
+
+
+def fulfil(cancellation: Cancellation, order: Order, estimator: Estimator) -> Answer:
+    """Decode, estimate and encode.
+
+    Raises ``InvalidImage``, ``UnsupportedKind``, ``TooLarge``, ``ImageSizeMismatch``, ``BadRequest`` for what no such
+    photograph can be asked, and ``Cancelled``.
+    """
+    stopwatch = Stopwatch()
+    with stopwatch.stage("decode"):
+        photograph = read_photograph(order.upload.data, order.upload.media_type, order.limits)
+    camera, resized = camera_of(photograph, order.camera)
+    lens = order.record.draft.lens
+    taken = other_lens(photograph.shot, lens) if lens else ()
+    part = order.query.part or Part(0, 0, photograph.width_px, photograph.height_px)
+    part.require_within(photograph.width_px, photograph.height_px)
+    for u, v in order.query.points:
+        pixel_at(u, v, part)
+    known = order.query.known_depths
+    for point in known:
+        pixel_at(point.u, point.v, Part(0, 0, photograph.width_px, photograph.height_px), "known")
+    depth_map = estimator.estimate(photograph.rgb, camera, order.query.side, cancellation, order.query.part, known)
+    stopwatch.add(depth_map.timings_ms)
+    warnings = (*order.warnings, *photograph.warnings, *taken, *resized, *depth_map.warnings)
+    with stopwatch.stage("encode"):
+        encoded = tuple(
+            _as_json(depth_map, order, part, estimator.manifest.name, warnings)
+            if wanted == JSON
+            else ENCODERS[wanted](depth_map, part.of(photograph.rgb))
+            for wanted in order.formats
+        )
+    lost = (words for one in encoded for words in one.warnings)
+    return Answer(encoded, depth_map.camera, (*warnings, *lost), stopwatch.elapsed_ms)
+
+
+def _as_json(depth_map: DepthMap, order: Order, part: Part, model: str, warnings: tuple[str, ...]) -> Encoded:
+    read = DepthRead(
+        camera=order.record.name,
+        revision=order.record.revision,
+        model=model,
+        width_px=depth_map.width_px,
+        height_px=depth_map.height_px,
+        depth_m=SpreadRead.model_validate(spread_of(depth_map)),
+        valid_fraction=depth_map.valid_fraction,
+        points=[PointRead.model_validate(read_point(depth_map, u, v, part)) for u, v in order.query.points],
+        warnings=list(warnings),
+    )
+    return Encoded(read.model_dump_json().encode(), FORMAT_TYPES[JSON])
+
+
+def _focused(camera: Camera, focus_distance_m: float | None) -> tuple[Camera, tuple[str, ...]]:
+    """The camera at this shot's focus distance, with a warning where that is not exact."""
+    if focus_distance_m is None or focus_distance_m == camera.focus_distance_m:
+        return camera, ()
+    try:
+        focused = camera.focused_at(focus_distance_m)
+    except ValueError as exc:
+        detail = f"The camera cannot focus at {focus_distance_m:g} m: {exc}."
+        raise BadRequest(detail, errors=(FieldProblem("focus_distance_m", detail),)) from exc
+    if camera.focal_length_m is None:
+        return focused, ("The lens' focal length is unknown and was taken as far below the focus distance.",)
+    return focused, ()
