@@ -296,7 +296,7 @@ def add_camera(
         except ValidationError as exc:
             raise _failure(str(invalid_model(exc, "body")), WRONG_USE) from exc
         except ValueError as exc:
-            raise _failure(f"{file.name} is no JSON: {exc}", WRONG_USE) from exc
+            raise _failure(f"This is no JSON: {exc}", WRONG_USE) from exc
         with _ready_engine() as engine:
             record = Cameras(engine, owner).add(body.to_draft(body.name))
     typer.echo(_line_of(record))

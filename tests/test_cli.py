@@ -12,9 +12,11 @@ import cv2
 import numpy as np
 import pytest
 import typer
+from typer.testing import CliRunner, Result
 
 from service import cli
 from service.storage import schema
+from tests.inference.oracle_pair import brightness_for
 from tests.simulated_sheets import CAMERA, DEPTHS_M, shots
 
 CAMIND = Path(sys.executable).parent / "camind"
@@ -124,6 +126,104 @@ def test_a_folder_without_a_calibration_says_why(tmp_path: Path) -> None:
     grey = camind(tmp_path, "calibrate", str(tmp_path / "photos"), "--out", str(tmp_path / "grey.json"))
     assert grey.returncode == 1
     assert "no result: the circles could be measured in none of the photographs" in grey.stdout
+
+
+BENCH = {
+    "name": "bench",
+    "image_width_px": 64,
+    "image_height_px": 48,
+    "focus_distance_m": 2,
+    "k_cam_px": 4,
+    "gamma_px": 0,
+}
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder to work in, whose database knows the camera ``bench``."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CAMIND_DATA_DIR", str(tmp_path))
+    added = at_once("cameras", "add", "-", said=json.dumps(BENCH))
+    assert (added.exit_code, added.stdout) == (0, "bench\tr1\t4 px\t2 m\t64x48\n")
+    return tmp_path
+
+
+def at_once(*arguments: str, said: str = "") -> Result:
+    """As ``camind`` does, in this process: what is refused needs no other."""
+    return CliRunner().invoke(cli.app, arguments, input=said)
+
+
+@pytest.mark.parametrize(
+    ("specs", "code", "said"),
+    [
+        ("x", 2, "This is no JSON: "),
+        ("[]", 2, "valid dictionary"),
+        (json.dumps({**BENCH, "focus_distance_m": -2}), 2, "focus_distance_m: "),
+        (json.dumps({**BENCH, "k_cam_px": None}), 1, "exactly one of k_cam_px and lens"),
+        (json.dumps(BENCH), 1, "exists already"),
+    ],
+)
+@pytest.mark.usefixtures("bench")
+def test_what_is_no_new_camera_is_said(specs: str, code: int, said: str) -> None:
+    refused = at_once("cameras", "add", "-", said=specs)
+    assert refused.exit_code == code
+    assert said in refused.stderr
+    assert at_once("cameras", "list").stdout.count("\n") == 1
+
+
+def test_a_folder_of_photographs_becomes_depth(bench: Path, tiny_model_dir: Path) -> None:
+    photos, out = bench / "photos", bench / "depth"
+    photos.mkdir()
+    # the oracle reads blur off brightness: x is 0.5 and 1, so 2 / 1.5 and 2 / 2 m nearer than the focus
+    for name, blur_px in (("half", 2.0), ("whole", 4.0)):
+        cv2.imwrite(str(photos / f"{name}.png"), np.full((48, 64, 3), brightness_for(blur_px), np.uint8))
+    (photos / "broken.jpg").write_bytes(b"\xff\xd8\xff")
+    asked = ["depth", str(photos), "--camera", "bench", "--out", str(out), "--model", str(tiny_model_dir)]
+    asked += ["--side", "near", "--format", "npy", "--format", "json", "--at", "3,4"]
+
+    done = camind(bench, *asked, COLUMNS="200")
+    assert done.returncode == 1, done.stderr
+    assert "has depth of 2 of 3 photographs" in done.stdout
+    assert "no depth: The jpeg file" in done.stdout
+    assert sorted(file.name for file in out.iterdir()) == ["half.json", "half.npy", "whole.json", "whole.npy"]
+    for name, depth_m in (("half", 2 / 1.5), ("whole", 1.0)):
+        assert np.load(out / f"{name}.npy") == pytest.approx(np.full((48, 64), depth_m), rel=0.02)
+        assert json.loads((out / f"{name}.json").read_text())["points"][0]["depth_m"] == pytest.approx(
+            depth_m, rel=0.02
+        )
+
+    (photos / "broken.jpg").unlink()
+    (out / "half.npy").unlink()
+    kept = (out / "whole.npy").stat().st_mtime_ns
+    again = camind(bench, *asked, "--only-missing")
+    assert again.returncode == 0, again.stderr
+    assert "has depth of 1 of 1 photographs, and had that of 1" in again.stdout
+    assert (out / "half.npy").exists()
+    assert (out / "whole.npy").stat().st_mtime_ns == kept
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (("photos", "--camera", "other"), 1, "no camera 'other'"),
+        (("photos", "--camera", "bench", "--format", "gif"), 2, "format: "),
+        (("photos", "--camera", "bench", "--known", "1,2"), 2, "known.0: "),
+        (("photos", "--camera", "bench", "--out", "photos"), 2, "photos holds photographs"),
+        (("photos", "others/a.jpg", "--camera", "bench"), 2, "would become one file"),
+        (("empty", "--camera", "bench"), 2, "no photographs in empty"),
+    ],
+)
+@pytest.mark.usefixtures("bench")
+def test_what_cannot_be_asked_of_photographs_is_said_before_anything_is_made(
+    arguments: tuple[str, ...], code: int, said: str
+) -> None:
+    for name in ("photos/a.png", "others/a.jpg", "empty/notes.txt"):
+        Path(name).parent.mkdir()
+        Path(name).touch()
+    refused = at_once("depth", *arguments)
+    assert refused.exit_code == code
+    assert said in refused.stderr
+    assert not Path("depth").exists()
 
 
 @pytest.mark.parametrize(

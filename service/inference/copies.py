@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from service.inference.depth_map import fraction
 from service.inference.hypotheses import doubted
 from service.inference.pair import RawMaps
 from service.inference.part import Part
@@ -16,6 +17,9 @@ from service.opencv import cv2, log
 from service.optics import thin_lens
 from service.optics.camera import Camera
 
+# of gamma, and of the pixels: what is read too sharp of scenes whose gamma is known is no more
+CLEARLY_SHARPER, SHARPER_FRACTION = 0.7, 0.1
+SHARPEST = 0.05  # of the pixels, as sharp as whose gamma then is taken to be
 OCTAVES = np.float32(1 / np.log(2))
 
 
@@ -46,6 +50,17 @@ class Read:
         for rows in bands(p_near.shape):
             defocus = thin_lens.relative_defocus_from_blur(blur_px[rows], self.camera.gamma_px, self.camera.k_cam_px)
             p_near[rows] = doubted(p_near[rows], defocus)
+
+    def sharper_gamma_px(self) -> float | None:
+        """gamma, in pixels of the photograph, as its sharpest parts have it; None where the camera's may be true.
+
+        No blur is below gamma (eq. 6): where much of a photograph is clearly sharper, what was told is not its gamma,
+        but for instance that of a small copy, which is no softer by the pixel than the large picture it was made of.
+        """
+        blur_px, to_px = self.maps["blur_px"], self.camera.image_width_px
+        if fraction(blur_px < CLEARLY_SHARPER * self.camera.gamma_px) <= SHARPER_FRACTION:
+            return None
+        return thin_lens.gamma_before_averaging(float(np.quantile(blur_px, SHARPEST)), self.area.width_px, to_px)
 
     def maps_from(self, inner: Part) -> RawMaps:
         """The maps, as views, from where an area within this one begins."""

@@ -60,6 +60,7 @@ class _Request:
     part: Part | None = None
     stopwatch: Stopwatch = field(default_factory=Stopwatch)
     sights: Sights | None = None  # of small copies, where they are read for more than one camera
+    warnings: tuple[str, ...] = ()
 
     def area(self, scale: float, multiple: int) -> Part:
         """What a copy of this scale shows: the photograph, or the part and what the copy needs around it.
@@ -119,7 +120,7 @@ class Estimator:
         if (width, height) != (camera.image_width_px, camera.image_height_px):
             raise ValueError(f"the camera must be that of a {width}x{height} image: resize it first")
         request, clues = self._heard(_Request(rgb, camera, side, cancellation or Cancellation(), part), known)
-        read = self._read_copies(request, self._base_scale(request.camera))
+        request, read = self._read_sharp(request)
         area, stopwatch = read.area, request.stopwatch
         size = (area.height_px, area.width_px)
         reading, told = self._reading(request, read, clues)
@@ -142,7 +143,12 @@ class Estimator:
             within = part.within(area)
             answer, blur_px = answer.cut(within), within.cells_of(blur_px, size)
         blurrier = fraction(blur_px > read.most_blur_px / reading.scale)
-        warnings = (*told, *self._warnings(reading, whole=part is None), *_hardness(blurrier, answer.valid_fraction))
+        warnings = (
+            *request.warnings,
+            *told,
+            *self._warnings(reading, whole=part is None),
+            *_hardness(blurrier, answer.valid_fraction),
+        )
         return replace(answer, warnings=warnings)
 
     def read(self, rgb: NDArray[np.uint8], camera: Camera, side: Side = "auto") -> Read:
@@ -160,10 +166,22 @@ class Estimator:
         scale = self._base_scale(request.camera)
         is_small = scale**2 * request.rgb.shape[0] * request.rgb.shape[1] <= SMALL_PX
         part = request.part if is_small else around(known)
-        read = self._read_copies(replace(request, side="auto", part=part), scale)
+        heard, read = self._read_sharp(replace(request, side="auto", part=part))
         with request.stopwatch.stage("correct"):
-            clues = Clues.of(read, request.camera, request.side, known)
-        return replace(request, camera=clues.camera), clues
+            clues = Clues.of(read, heard.camera, request.side, known)
+        return replace(request, camera=clues.camera, warnings=heard.warnings), clues
+
+    def _read_sharp(self, request: _Request) -> tuple[_Request, Read]:
+        """What the copies show, and the request by a camera that can have taken what is sharp in them."""
+        scale = self._base_scale(request.camera)
+        read = self._read_copies(request, scale)
+        gamma_px = read.sharper_gamma_px()
+        if gamma_px is None or _is_blank(request.rgb):
+            return request, read
+        camera, told_px = replace(request.camera, gamma_px=gamma_px), request.camera.gamma_px
+        said = f"gamma_px taken as {gamma_px:.3g}, where {told_px:.3g} was told: the photograph is sharper than that"
+        request = replace(request, camera=camera, warnings=(*request.warnings, said))
+        return request, self._read_copies(request, scale)
 
     def _reading(self, request: _Request, read: Read, clues: Clues | None) -> tuple[Reading, tuple[str, ...]]:
         """What the networks' maps, which are written over, and known depths say together, and what to know of those."""

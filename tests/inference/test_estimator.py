@@ -97,6 +97,32 @@ def test_by_a_k_cam_below_those_that_the_model_knows_errors_grow_until_nothing_i
     assert not estimator.estimate(grey(13), nil, "near").valid.any()
 
 
+def half_sharp(sharp_px: float, blurred: int = 130) -> NDArray[np.uint8]:
+    """Half a photograph in focus, half as blurred as a level of grey says."""
+    picture = grey(blurred)
+    picture[:, :48] = brightness_for(sharp_px)
+    return picture
+
+
+def test_no_photograph_is_sharper_than_its_gamma(estimator: Estimator) -> None:
+    # registered at a sixth of the size, where the copy was as soft by the pixel
+    soft = replace(CAMERA, gamma_px=6 * CAMERA.gamma_px)
+    answer = estimator.estimate(half_sharp(1.0), soft, "near")
+    sharp_px = blur_of(brightness_for(1.0))
+    x = thin_lens.relative_defocus_from_blur(blur_of(130), sharp_px, CAMERA.k_cam_px)
+    assert answer.camera.gamma_px == pytest.approx(sharp_px, rel=1e-3)
+    np.testing.assert_allclose(answer.depth_m[:, :40], CAMERA.focus_distance_m, rtol=3e-3)
+    np.testing.assert_allclose(answer.depth_m[:, 56:], thin_lens.depth_near(x, CAMERA.focus_distance_m), rtol=3e-3)
+    assert answer.warnings == ("gamma_px taken as 1.02, where 3 was told: the photograph is sharper than that",)
+
+
+@pytest.mark.parametrize("gamma_px", [0.0, 0.5, 1.3])
+def test_a_gamma_that_may_be_true_is_taken(estimator: Estimator, gamma_px: float) -> None:
+    answer = estimator.estimate(half_sharp(1.0), replace(CAMERA, gamma_px=gamma_px), "near")
+    assert answer.camera.gamma_px == gamma_px
+    assert answer.warnings == ()
+
+
 @pytest.mark.parametrize("level", [2, 253])
 def test_of_a_lens_cap_or_an_overexposed_photograph_nothing_is_answered(estimator: Estimator, level: int) -> None:
     noise = np.random.default_rng(0).integers(-2, 3, (64, 96, 3))
