@@ -184,5 +184,5 @@ def test_an_edge_is_as_steep_after_sharpening_as_one_of_the_blur_asked_for(blur_
 def test_gamma_of_a_smaller_picture_is_between_its_scaled_self_and_itself(gamma_px: float, ratio: float) -> None:
     small = thin_lens.gamma_after_shrinking(gamma_px, ratio)
     assert gamma_px * ratio - 1e-9 <= small <= gamma_px + 1e-9
-    assert small >= min(gamma_px, thin_lens.PIXEL_BOX_VARIANCE**0.5) - 1e-9
+    assert small >= min(gamma_px, thin_lens.SHRUNK_GAMMA_PX) - 1e-9
     assert thin_lens.gamma_after_shrinking(gamma_px, 1) == pytest.approx(gamma_px)
