@@ -46,7 +46,7 @@ def calibrate_folder(folder: Path, task: Task, limits: ImageLimits, out: Path) -
 
         report = calibrate(task, pictures, tell=tell)
         progress.update(bar, completed=1.0)
-    Console().print(_table(report))
+    Console(markup=False, emoji=False).print(_table(report))  # a file's name is no markup
     out.write_bytes(REPORT.dump_json(report, indent=1))
     if report.result is not None:
         from service.calibration.plot import as_svg

@@ -1,4 +1,4 @@
-"""Depth of photographs on a disk, for the command line: progress, a map beside each other's, and a table."""
+"""Depth of photographs on a disk, for the command line: a progress bar, files, and a table."""
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -81,7 +81,7 @@ def depth_folder(places: Sequence[Path], errand: Errand, settings: Settings, *, 
         failed = sum(one.read is None for one in made.values())
     there = f", and had that of {len(every) - len(wanted)}" if is_missing_only else ""
     told = f"{errand.out} has depth of {len(wanted) - failed} of {len(wanted)} photographs{there}"
-    Console(soft_wrap=True).print(told, highlight=False)
+    Console(soft_wrap=True, markup=False, emoji=False).print(told, highlight=False)
     return failed
 
 
@@ -158,7 +158,7 @@ def _print(made: Sequence[tuple[Path, Made]]) -> None:
         for at in one.read.points:
             found = map(_metres, (at.depth_m, at.sigma_m, at.depth_alt_m))
             points.add_row(path.name, f"{at.u:g}", f"{at.v:g}", *found)
-    console = Console()
+    console = Console(markup=False, emoji=False)  # a file's name is no markup
     for table in (depths, points):
         if table.row_count:
             console.print(table)

@@ -175,7 +175,7 @@ def test_a_folder_of_photographs_becomes_depth(bench: Path, tiny_model_dir: Path
     photos, out = bench / "photos", bench / "depth"
     photos.mkdir()
     # the oracle reads blur off brightness: x is 0.5 and 1, so 2 / 1.5 and 2 / 2 m nearer than the focus
-    for name, blur_px in (("half", 2.0), ("whole", 4.0)):
+    for name, blur_px in (("half [b]", 2.0), ("whole", 4.0)):
         cv2.imwrite(str(photos / f"{name}.png"), np.full((48, 64, 3), brightness_for(blur_px), np.uint8))
     (photos / "broken.jpg").write_bytes(b"\xff\xd8\xff")
     asked = ["depth", str(photos), "--camera", "bench", "--out", str(out), "--model", str(tiny_model_dir)]
@@ -185,20 +185,20 @@ def test_a_folder_of_photographs_becomes_depth(bench: Path, tiny_model_dir: Path
     assert done.returncode == 1, done.stderr
     assert "has depth of 2 of 3 photographs" in done.stdout
     assert "no depth: The jpeg file" in done.stdout
-    assert sorted(file.name for file in out.iterdir()) == ["half.json", "half.npy", "whole.json", "whole.npy"]
-    for name, depth_m in (("half", 2 / 1.5), ("whole", 1.0)):
+    assert sorted(file.name for file in out.iterdir()) == ["half [b].json", "half [b].npy", "whole.json", "whole.npy"]
+    for name, depth_m in (("half [b]", 2 / 1.5), ("whole", 1.0)):
         assert np.load(out / f"{name}.npy") == pytest.approx(np.full((48, 64), depth_m), rel=0.02)
         assert json.loads((out / f"{name}.json").read_text())["points"][0]["depth_m"] == pytest.approx(
             depth_m, rel=0.02
         )
 
     (photos / "broken.jpg").unlink()
-    (out / "half.npy").unlink()
+    (out / "half [b].npy").unlink()
     kept = (out / "whole.npy").stat().st_mtime_ns
     again = camind(bench, *asked, "--only-missing")
     assert again.returncode == 0, again.stderr
     assert "has depth of 1 of 1 photographs, and had that of 1" in again.stdout
-    assert (out / "half.npy").exists()
+    assert (out / "half [b].npy").exists()
     assert (out / "whole.npy").stat().st_mtime_ns == kept
 
 
