@@ -56,7 +56,10 @@ REFERENCE = Camera(640, 480, 2.0, 3.81, 0.5, intrinsics=Intrinsics.centred(FRAME
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Case:
-    """One picture to answer: ``truth_m`` is NaN where it is not scored, ``blur_px`` None where lambda is not known."""
+    """One picture to answer: ``truth_m`` is NaN where it is not scored, ``blur_px`` None where lambda is not known.
+
+    Two are equal where they are one: what was found of a case is remembered by it.
+    """
 
     name: str
     image: NDArray[np.uint8]
@@ -279,7 +282,8 @@ def trials(data: Path, quick: bool) -> list[Trial]:
         found += _indoor_trials(folder, quick)
     if (data / "d200").is_dir():
         source = partial(d200_cases, data / "d200", 2 * many)
-        further = ("right side", "ring from the sensor", *MISFOCUSED, "gt" + KNOWN_DEPTHS, MISFOCUSED[1] + KNOWN_DEPTHS)
+        told = ("ring from the sensor", "registered large", *MISFOCUSED)
+        further = ("right side", *told, "gt" + KNOWN_DEPTHS, MISFOCUSED[1] + KNOWN_DEPTHS)
         found.append(replace(_trial("d200", source, *further), factors=ORACLE_FACTORS))
     return found
 

@@ -33,6 +33,7 @@ from service.optics.camera import Camera
 
 # an unknown camera is taken for the middle one of those that are scored
 UNKNOWN_K_CAM_PX = math.prod(UNSEEN_K_CAM_PX) ** (1 / len(UNSEEN_K_CAM_PX))
+SENSOR_TIMES = 6  # as wide as the real lens' pictures
 
 
 def _misled(factor: float, camera: Camera) -> Camera:
@@ -50,6 +51,13 @@ def _counted_from_lens(camera: Camera) -> Camera:
     return camera.focused_at(thin_lens.focus_from_lens(camera.focus_distance_m, camera.focal_length_m or 0.0))
 
 
+def _registered_large(camera: Camera) -> Camera:
+    """The camera as registered with the size of its sensor, its pictures made a sixth as large by whatever program."""
+    width_px, height_px = camera.image_width_px, camera.image_height_px
+    large = camera.resized(SENSOR_TIMES * width_px, SENSOR_TIMES * height_px)
+    return replace(large, gamma_px=camera.gamma_px).resampled(width_px, height_px)
+
+
 MODES: dict[str, Callable[[Camera], Camera]] = {
     "gt": lambda camera: camera,
     "estimated k_cam": calibrated,
@@ -59,6 +67,7 @@ MODES: dict[str, Callable[[Camera], Camera]] = {
     "focus -10%": partial(_misfocused, 0.9),
     "focus +10%": partial(_misfocused, 1.1),
     "ring from the sensor": _counted_from_lens,
+    "registered large": _registered_large,
 }
 # what no user has: they tell how much of an error is the camera's, and how much the side's
 RIGHT_SIDE, ORACLE_K_CAM = "right side", "oracle k_cam"
