@@ -113,7 +113,8 @@ class Estimator:
 
         Of a ``part`` alone it costs what the part and its surroundings cost. Where depths are ``known``, of pixels
         within the photograph, it is first read from one to the other: the answer is then by the camera focused where
-        they say, and theirs where they are. Raises ``ValueError`` for a camera of another size and ``Cancelled`` when
+        they say, and theirs where they are. Of a photograph that is sharper than the camera's gamma allows, gamma is
+        what it shows; the answer's ``camera`` has it. Raises ``ValueError`` for a camera of another size and ``Cancelled`` when
         asked to stop.
         """
         height, width = rgb.shape[:2]
@@ -143,13 +144,8 @@ class Estimator:
             within = part.within(area)
             answer, blur_px = answer.cut(within), within.cells_of(blur_px, size)
         blurrier = fraction(blur_px > read.most_blur_px / reading.scale)
-        warnings = (
-            *request.warnings,
-            *told,
-            *self._warnings(reading, whole=part is None),
-            *_hardness(blurrier, answer.valid_fraction),
-        )
-        return replace(answer, warnings=warnings)
+        said = (*request.warnings, *told, *self._warnings(reading, whole=part is None))
+        return replace(answer, warnings=(*said, *_hardness(blurrier, answer.valid_fraction)))
 
     def read(self, rgb: NDArray[np.uint8], camera: Camera, side: Side = "auto") -> Read:
         """What the networks answer, before it is decided what that means: for measuring them."""
