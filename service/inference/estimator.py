@@ -114,8 +114,8 @@ class Estimator:
         Of a ``part`` alone it costs what the part and its surroundings cost. Where depths are ``known``, of pixels
         within the photograph, it is first read from one to the other: the answer is then by the camera focused where
         they say, and theirs where they are. Of a photograph that is sharper than the camera's gamma allows, gamma is
-        what it shows; the answer's ``camera`` has it. Raises ``ValueError`` for a camera of another size and ``Cancelled`` when
-        asked to stop.
+        what it shows; the answer's ``camera`` has it. Raises ``ValueError`` for a camera of another size and
+        ``Cancelled`` when asked to stop.
         """
         height, width = rgb.shape[:2]
         if (width, height) != (camera.image_width_px, camera.image_height_px):
