@@ -5,6 +5,7 @@ from pathlib import Path
 
 from service.inference.artifact import Interval, Ranges, Training, load_model_folder, sha256_of, write_manifest
 
+SOURCES_LEAD = "Pictures that scenes were made of:"
 SCORES_HEADING = "## Scores"
 
 
@@ -37,7 +38,7 @@ Beyond them an answer is a guess and the service says so in its warnings.
 
 ## Licence and sources
 
-Weights: Apache-2.0. Pictures that scenes were made of:
+Weights: Apache-2.0. {SOURCES_LEAD}
 
 {sources.strip() or "none but what the generator draws"}
 
@@ -50,6 +51,11 @@ Not evaluated yet.
 def _range_rows(ranges: Ranges) -> str:
     rows: dict[str, Interval] = {field: getattr(ranges, field) for field in type(ranges).model_fields}
     return "\n".join(f"| `{name}` | {low:g} | {high:g} |" for name, (low, high) in rows.items())
+
+
+def sources_of(card: str) -> str:
+    """Where a card says that the training pictures come from, and under which licence."""
+    return card.partition(SOURCES_LEAD)[2].partition(SCORES_HEADING)[0].strip()
 
 
 def with_scores(card: str, tables: Mapping[str, str], command: str) -> str:

@@ -39,7 +39,7 @@ Threads = Annotated[
         show_default="those that workers leave",
     ),
 ]
-Checkpoint = Annotated[Path, typer.Option(help="checkpoint file of a run", exists=True, dir_okay=False)]
+Checkpoint = Annotated[Path, typer.Option(help="checkpoint file of a run, or a model folder", exists=True)]
 
 BLENDER_ENVIRONMENT = Path(".venv-blender")
 FILE_COLUMNS = 160
@@ -168,12 +168,19 @@ def average(
 @commands.command()
 def export(
     checkpoint: Checkpoint,
-    textures: Textures,
     out: Annotated[Path, typer.Option(help="model folder to write")],
+    textures: Annotated[
+        Path | None, typer.Option(help="pictures that a run was trained with, with LICENCES.md", exists=True)
+    ] = None,
     frames: Frames = None,
     name: Annotated[str | None, typer.Option(help="name of the model")] = None,
 ) -> None:
-    """Write a checkpoint as a model folder, and in it one in int8: two ONNX graphs, card and manifest each."""
+    """Write a checkpoint as a model folder, and in it one in int8: two ONNX graphs, card and manifest each.
+
+    A model folder is written anew, as what this version makes of its weights; its card says what they learned from.
+    """
+    if textures is None and checkpoint.is_file():
+        raise _fail("the card of a run states the licences of its pictures: name them with --textures")
     with _training_parts():
         from model_export.corrections import calibrate, unseen_cases
         from model_export.export import export_checkpoint

@@ -12,7 +12,7 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from model_export.card import card_text
+from model_export.card import card_text, sources_of
 from model_export.config import SceneConfig, TrainConfig
 from model_export.folded import folded
 from model_export.networks import (
@@ -37,6 +37,7 @@ from service.inference.artifact import (
     Ranges,
     TensorSpec,
     Training,
+    load_model_folder,
     sha256_of,
     write_manifest,
 )
@@ -267,8 +268,14 @@ def export_checkpoint(
     name: str | None = None,
     write_graphs: Callable[[Pair, Path], Graphs] = export_graphs,
 ) -> Manifest:
-    """Write the model folder of a checkpoint file; the card carries the licences of the folders it was trained with."""
+    """Write the model folder of a checkpoint file; the card carries the licences of the folders it was trained with.
+
+    Of a float32 model folder what today's code makes of its weights; of what they were trained with its card tells.
+    """
     loaded = Checkpoint.load(checkpoint)
-    licences = (trained_with / LICENCES for trained_with in pictures)
-    sources = "".join(file.read_text() for file in licences if file.exists())
+    if checkpoint.is_dir():
+        sources = sources_of(load_model_folder(checkpoint).card())
+    else:
+        licences = (trained_with / LICENCES for trained_with in pictures)
+        sources = "".join(file.read_text() for file in licences if file.exists())
     return export_pair(loaded.pair(), loaded.config, loaded.step, folder, name, sources, write_graphs)

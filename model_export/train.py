@@ -38,6 +38,7 @@ from model_export.restored import restored, spread_norms
 from model_export.scenes import Material, Negative, Sample, Shot, draw_negative, draw_sample
 from model_export.textures import load_photographs
 from service.cores import available_cores
+from service.inference.artifact import load_model_folder
 
 FOCAL_UNKNOWN_SHARE = 0.3
 LEAST_CONTRAST = 0.15  # of a faded picture, as a part of what it had
@@ -273,8 +274,8 @@ class Checkpoint:
 
     @classmethod
     def load(cls, path: Path) -> "Checkpoint":
-        """Raises ``ValueError`` for a checkpoint of another version."""
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        """Of a file, or of a float32 model folder; raises ``ValueError`` for one of another version."""
+        content = _as_checkpoint(path) if path.is_dir() else torch.load(path, map_location="cpu", weights_only=True)
         try:
             config = TrainConfig.from_dict(content["config"])
         except TypeError as exc:
@@ -308,12 +309,18 @@ class Checkpoint:
         return pair
 
 
+def _as_checkpoint(folder: Path) -> dict[str, Any]:
+    """What a checkpoint would hold of a model folder, whose batch norms are folded away and wait for statistics."""
+    training = load_model_folder(folder).manifest.training
+    return {"config": training.config, "step": training.steps, "modules": restored(folder).modules().state_dict()}
+
+
 def starting_pair(weights: Path, kind: Kind) -> Pair:
-    """The networks of a checkpoint, or of a model folder, whose batch norms are folded away and wait for statistics.
+    """The networks of a checkpoint, or of a model folder.
 
     Raises ``ValueError`` for networks of another kind.
     """
-    pair = restored(weights) if weights.is_dir() else Checkpoint.load(weights).pair()
+    pair = Checkpoint.load(weights).pair()
     if pair.kind != kind:
         raise ValueError(f"weights of a {pair.kind} pair do not fit a {kind} pair")
     return pair
