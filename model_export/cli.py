@@ -181,6 +181,8 @@ def export(
     """
     if textures is None and checkpoint.is_file():
         raise _fail("the card of a run states the licences of its pictures: name them with --textures")
+    if out.resolve() == checkpoint.resolve():
+        raise _fail(f"{out} would be written over while it is read")
     with _training_parts():
         from model_export.corrections import calibrate, unseen_cases
         from model_export.export import export_checkpoint
@@ -189,7 +191,10 @@ def export(
     pictures = [folder for folder in (textures, frames) if folder is not None]
     with progress_bar(Console(stderr=True)) as progress:
         task = progress.add_task("float32", total=5)
-        manifest = export_checkpoint(checkpoint, pictures, out, name)
+        try:
+            manifest = export_checkpoint(checkpoint, pictures, out, name)
+        except ValueError as exc:
+            raise _fail(str(exc)) from exc
         progress.update(task, advance=1, description=INT8)
         in_int8 = partial(quantised_graphs, floating=out)
         export_checkpoint(checkpoint, pictures, out / INT8, f"{manifest.name}-{INT8}", in_int8)
@@ -208,7 +213,10 @@ def verify(checkpoint: Checkpoint, model: Model = DEFAULT_MODEL) -> None:
     with _training_parts():
         from model_export.verify import TOLERANCE, verify_checkpoint
 
-    differences = verify_checkpoint(checkpoint, model)
+    try:
+        differences = verify_checkpoint(checkpoint, model)
+    except ValueError as exc:
+        raise _fail(str(exc)) from exc
     Console().print(_differences(differences))
     worst = max(d.relative for d in differences)
     if not worst <= TOLERANCE:

@@ -24,8 +24,6 @@ BLUR_BOUNDS_PX = (0.2, 60.0)
 LOG_ERROR_BOUNDS = (-5.0, 1.5)
 SPREAD_BOUNDS = (0.01, 2.0)
 RATIO_BOUND = 3.5
-# how much less plain inversion is believed than it states, in variance: errors of blur are alike over many cells
-PLAIN_DOUBT = 8.0
 LUMINANCE = (0.299, 0.587, 0.114)
 GREY = 0.5
 BLOCK = 16  # maps that ONNX Runtime computes at a time
@@ -372,16 +370,6 @@ def _plane(values: Tensor, like: Tensor) -> Tensor:
     return values[:, None, None, None].expand(-1, 1, like.shape[2], like.shape[3])
 
 
-def _weighed(plain: Tensor, own: Tensor, spread: Tensor, log_scale: Tensor) -> Tensor:
-    """ln(z / s1) by plain inversion beside the network's own, as sure as the spread of x makes it (x = exp(-ln) - 1).
-
-    A network draws towards focus what is read well; where blur states less error than the network does, it tells.
-    """
-    variance = torch.exp(2 * log_scale)
-    plain_variance = PLAIN_DOUBT * (spread * torch.exp(plain)) ** 2
-    return torch.lerp(own, plain, variance / (variance + plain_variance))
-
-
 class CompactBlur(nn.Module):
     """Ours: pixels and band energies at half size into a small U-Net; hands its last features on."""
 
@@ -410,8 +398,8 @@ class CompactBlur(nn.Module):
 class CompactDepth(nn.Module):
     """Ours: starts from the plain inversion and mixes in what the surroundings say, by a learned gate.
 
-    Where blur is certain the gate lets eq. 7 through, and so do the errors that are stated; on flat ground the free
-    estimate fills in. Either way near stays at or before the plane in focus and far behind it. Which it is the finest map tells, and the layout: but
+    Where blur is certain the gate lets eq. 7 through; on flat ground the free estimate fills in. Either way
+    near stays at or before the plane in focus and far behind it. Which it is the finest map tells, and the layout: but
     for where ``lays_out`` is off, while all else is learned of scenes too small to show one.
     """
 
@@ -445,11 +433,10 @@ class CompactDepth(nn.Module):
         with torch.autocast(defocus.device.type, enabled=False):
             out = functional.conv2d(x.float(), self.head.weight, self.head.bias)
             free_near, free_far = functional.logsigmoid(-out[:, 0:1]), -functional.logsigmoid(-out[:, 1:2])
-            gate, log_scale = torch.sigmoid(out[:, 2:3]), _bounded_log_error(out[:, 4:5])
-            own_near, own_far = torch.lerp(free_near, near, gate), torch.lerp(free_far, far, gate)
-            log_near = _weighed(near, own_near, spread, log_scale).clamp(-RATIO_BOUND, 0.0)
-            log_far = _weighed(far, own_far, spread, log_scale).clamp(0.0, RATIO_BOUND)
-        near_logit = enlarged + out[:, 3:4]
+            gate = torch.sigmoid(out[:, 2:3])
+            log_near = (gate * near + (1 - gate) * free_near).clamp(-RATIO_BOUND, 0.0)
+            log_far = (gate * far + (1 - gate) * free_far).clamp(0.0, RATIO_BOUND)
+        near_logit, log_scale = enlarged + out[:, 3:4], _bounded_log_error(out[:, 4:5])
         return LaidOutEstimate(log_near, log_far, near_logit, log_scale, coarsest, layout_odds)
 
 

@@ -7,14 +7,17 @@ import numpy as np
 import pytest
 import torch
 from onnxruntime import InferenceSession
+from typer.testing import CliRunner
 
+from model_export.cli import commands
 from model_export.config import SceneConfig
+from model_export.export import export_checkpoint
 from model_export.losses import Batch, run_pair
 from model_export.networks import Pair
 from model_export.restored import restored, spread_norms
 from model_export.scenes import Material
 from model_export.train import held_out
-from service.inference.artifact import load_model_folder, write_manifest
+from service.inference.artifact import Graphs, load_model_folder, write_manifest
 
 SHIPPED = Path(__file__).parents[2] / "service" / "models"
 GAIN = 0.9
@@ -70,3 +73,51 @@ def test_in_training_mode_the_norms_see_what_they_were_set_to(shipped: Path, bat
 def test_another_kind_of_folder_is_refused() -> None:
     with pytest.raises(ValueError, match="no folded graphs"):
         restored(SHIPPED / "int8")
+
+
+def test_a_folder_is_exported_anew_with_its_weights_and_what_they_learned_from(shipped: Path, tmp_path: Path) -> None:
+    given: list[Pair] = []
+
+    def write_graphs(pair: Pair, folder: Path) -> Graphs:
+        given.append(pair)
+        graphs = load_model_folder(shipped).manifest.graphs
+        for graph in (graphs.blur, graphs.depth, graphs.layout):
+            assert graph is not None
+            shutil.copy(shipped / graph.file, folder)
+        return graphs
+
+    manifest = export_checkpoint(shipped, (), tmp_path / "anew", write_graphs=write_graphs)
+    own, expected = given[0].modules().state_dict(), restored(shipped).modules().state_dict()
+    torch.testing.assert_close(own, expected, rtol=0, atol=0)
+    before, anew = load_model_folder(shipped), load_model_folder(tmp_path / "anew")
+    assert (manifest.training.config, manifest.training.steps, manifest.ranges) == (
+        before.manifest.training.config,
+        before.manifest.training.steps,
+        before.manifest.ranges,
+    )
+    licences = anew.card().partition("## Licence and sources")[2].partition("## Scores")[0]
+    assert "CC0" in licences
+    assert licences in before.card()
+
+
+@pytest.mark.parametrize(
+    ("checkpoint", "out", "said"),
+    [
+        ("checkpoint.pt", "model", "--textures"),
+        ("runs", "model", "is this a model folder?"),
+        ("int8", "model", "has no folded graphs"),
+        ("runs", "runs", "written over"),
+    ],
+)
+def test_what_cannot_be_exported_is_said_and_nothing_written(
+    checkpoint: str, out: str, said: str, tmp_path: Path
+) -> None:
+    (tmp_path / "checkpoint.pt").touch()
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "int8").symlink_to(SHIPPED / "int8")
+    arguments = ["export", "--checkpoint", tmp_path / checkpoint, "--out", tmp_path / out]
+    result = CliRunner().invoke(commands, list(map(str, arguments)))
+    assert result.exit_code == 1
+    assert said in result.stderr.replace("\n", "")
+    assert not (tmp_path / "model").exists()
+    assert not any((tmp_path / "runs").iterdir())
