@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from typing import Annotated, Any
 
 from pydantic import BaseModel, Field, ValidationError
@@ -9,6 +10,7 @@ from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
 from service.errors import BadRequest, Busy, CamindError, FieldProblem, InsufficientStorage, NotReady
+from service.optics.camera import Lens
 
 PROBLEM_TYPE = "application/problem+json"
 # where a scope says which problem it was answered with
@@ -27,6 +29,7 @@ PLAIN_WORDS = {
     "int_from_float": A_WHOLE_NUMBER,
     "bool_type": "this must be true or false",
 }
+LENS_FIELDS = frozenset(field.name for field in fields(Lens))
 # what reading the database may answer, and what writing to it may
 STORE_ERRORS = (Busy, NotReady)
 WRITE_ERRORS = (*STORE_ERRORS, InsufficientStorage)
@@ -188,12 +191,15 @@ def _detail(fault: Mapping[str, Any]) -> str:
     if fault["type"] == "json_invalid":
         return f"This is no JSON: {fault['ctx']['error']} at character {fault['loc'][-1]}."
     if fault["type"] == "extra_forbidden":
-        return _unknown_field(str(fault["loc"][-1]))
+        return _unknown_field(*map(str, fault["loc"]))
     words = PLAIN_WORDS.get(fault["type"], str(fault["msg"]))
     return _printable(words.removeprefix("Value error, "))
 
 
-def _unknown_field(name: str) -> str:
+def _unknown_field(*path: str) -> str:
+    name = path[-1]
+    if path == ("body", name) and name in LENS_FIELDS:
+        return f'It belongs to the lens: send it there, as in {{"lens": {{"{name}": ...}}}}.'
     if re.search("35_?mm|equivalent", name, re.IGNORECASE):
         return (
             "A 35-mm-equivalent focal length is not the lens' focal length, and k_cam grows with its square: "

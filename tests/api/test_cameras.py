@@ -216,6 +216,15 @@ def test_an_equivalent_focal_length_is_explained(
     assert "focal_length_mm" in fault["detail"]
 
 
+def test_lens_specs_beside_the_camera_are_told_their_place(client: TestClient, d200: dict[str, Any]) -> None:
+    lens = d200.pop("lens")
+    answer = client.post("/cameras", json=d200 | lens)
+    assert answer.status_code == 422
+    faults = {fault["pointer"]: fault["detail"] for fault in answer.json()["errors"]}
+    assert {f"#/{name}" for name in lens} <= faults.keys()
+    assert all(f'{{"lens": {{"{name}": ...}}}}' in faults[f"#/{name}"] for name in lens)
+
+
 NUMBERS = ["image_width_px", "image_height_px", "focus_distance_m", "k_cam_px"]
 LENS_NUMBERS = ["focal_length_mm", "f_number", "pixel_pitch_um", "sensor_width_px", "k_r"]
 BAD = [

@@ -163,6 +163,7 @@ def clients(app: FastAPI) -> Iterator[list[TestClient]]:
         yield [TestClient(app, headers={"Authorization": f"Bearer {text}"}) for text in texts]
 
 
+@pytest.mark.timeout(3600)
 def test_any_sequence_leaves_what_a_dictionary_holds(clients: list[TestClient], is_soak: bool) -> None:
     class Machine(CameraMachine):
         def __init__(self) -> None:
