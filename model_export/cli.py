@@ -170,7 +170,8 @@ def export(
     checkpoint: Checkpoint,
     out: Annotated[Path, typer.Option(help="model folder to write")],
     textures: Annotated[
-        Path | None, typer.Option(help="pictures that a run was trained with, with LICENCES.md", exists=True)
+        Path | None,
+        typer.Option(help="pictures that a run was trained with, with LICENCES.md", exists=True, file_okay=False),
     ] = None,
     frames: Frames = None,
     name: Annotated[str | None, typer.Option(help="name of the model")] = None,

@@ -316,11 +316,11 @@ def _as_checkpoint(folder: Path) -> dict[str, Any]:
 
 
 def starting_pair(weights: Path, kind: Kind) -> Pair:
-    """The networks of a checkpoint, or of a model folder.
+    """The networks of a checkpoint, or of a model folder, which may be of another version: its config is not asked for.
 
     Raises ``ValueError`` for networks of another kind.
     """
-    pair = Checkpoint.load(weights).pair()
+    pair = restored(weights) if weights.is_dir() else Checkpoint.load(weights).pair()
     if pair.kind != kind:
         raise ValueError(f"weights of a {pair.kind} pair do not fit a {kind} pair")
     return pair
