@@ -24,6 +24,9 @@ BLUR_BOUNDS_PX = (0.2, 60.0)
 LOG_ERROR_BOUNDS = (-5.0, 1.5)
 SPREAD_BOUNDS = (0.01, 2.0)
 RATIO_BOUND = 3.5
+# where plain inversion tells: its variance, this many times, is below the network's (the odds grow with the ratio's
+# power), and both are apart by no more than this (ln z, standard deviation); chosen in docs/training.md
+PLAIN_DOUBT, PLAIN_POWER, PLAIN_APART = 6.0, 3.0, 0.1
 LUMINANCE = (0.299, 0.587, 0.114)
 GREY = 0.5
 BLOCK = 16  # maps that ONNX Runtime computes at a time
@@ -370,6 +373,17 @@ def _plane(values: Tensor, like: Tensor) -> Tensor:
     return values[:, None, None, None].expand(-1, 1, like.shape[2], like.shape[3])
 
 
+def _weighed(plain: Tensor, own: Tensor, log_spread: Tensor, log_scale: Tensor) -> Tensor:
+    """ln(z / s1): the network's own, or plain inversion where that states far less error and both nearly agree.
+
+    A network draws towards focus what is little out of it, however well its blur is read. An error of x is one of
+    z / s1 times that in ln z, on either side (eq. 7).
+    """
+    apart = plain - own
+    surer = 2 * (log_scale - log_spread - plain) - math.log(PLAIN_DOUBT)
+    return own + torch.sigmoid(PLAIN_POWER * surer - (apart / PLAIN_APART) ** 2 / 2) * apart
+
+
 class CompactBlur(nn.Module):
     """Ours: pixels and band energies at half size into a small U-Net; hands its last features on."""
 
@@ -398,9 +412,10 @@ class CompactBlur(nn.Module):
 class CompactDepth(nn.Module):
     """Ours: starts from the plain inversion and mixes in what the surroundings say, by a learned gate.
 
-    Where blur is certain the gate lets eq. 7 through; on flat ground the free estimate fills in. Either way
-    near stays at or before the plane in focus and far behind it. Which it is the finest map tells, and the layout: but
-    for where ``lays_out`` is off, while all else is learned of scenes too small to show one.
+    Where blur is certain the gate lets eq. 7 through, and so do the errors that are stated; on flat ground the free
+    estimate fills in. Either way near stays at or before the plane in focus and far behind it. Which it is the finest
+    map tells, and the layout: but for where ``lays_out`` is off, while all else is learned of scenes too small to show
+    one.
     """
 
     DILATIONS = (2, 4)
@@ -425,7 +440,8 @@ class CompactDepth(nn.Module):
             known = (scene.focal_length_px > 0).float()
             focal = torch.log(scene.focal_length_px.clamp_min(50.0) / 600.0) * known
             planes = [torch.log(scene.focus_distance_m), focal, known, scene.side]
-            inputs = [near, far, defocus.clamp(max=3.0), torch.log(spread.clamp(1e-3, 10.0)) * 0.3]
+            log_spread = torch.log(spread.clamp(1e-3, 10.0))
+            inputs = [near, far, defocus.clamp(max=3.0), log_spread * 0.3]
             inputs += [_plane(p, defocus) for p in planes]
         *_, coarsest, x = self.unet(*features, torch.cat(inputs, 1))
         layout_odds = self.layout(coarsest) if self.lays_out else torch.zeros_like(coarsest[:, :1])
@@ -433,10 +449,11 @@ class CompactDepth(nn.Module):
         with torch.autocast(defocus.device.type, enabled=False):
             out = functional.conv2d(x.float(), self.head.weight, self.head.bias)
             free_near, free_far = functional.logsigmoid(-out[:, 0:1]), -functional.logsigmoid(-out[:, 1:2])
-            gate = torch.sigmoid(out[:, 2:3])
-            log_near = (gate * near + (1 - gate) * free_near).clamp(-RATIO_BOUND, 0.0)
-            log_far = (gate * far + (1 - gate) * free_far).clamp(0.0, RATIO_BOUND)
-        near_logit, log_scale = enlarged + out[:, 3:4], _bounded_log_error(out[:, 4:5])
+            gate, log_scale = torch.sigmoid(out[:, 2:3]), _bounded_log_error(out[:, 4:5])
+            own_near, own_far = gate * near + (1 - gate) * free_near, gate * far + (1 - gate) * free_far
+            log_near = _weighed(near, own_near, log_spread, log_scale).clamp(-RATIO_BOUND, 0.0)
+            log_far = _weighed(far, own_far, log_spread, log_scale).clamp(0.0, RATIO_BOUND)
+        near_logit = enlarged + out[:, 3:4]
         return LaidOutEstimate(log_near, log_far, near_logit, log_scale, coarsest, layout_odds)
 
 
