@@ -24,8 +24,9 @@ BLUR_BOUNDS_PX = (0.2, 60.0)
 LOG_ERROR_BOUNDS = (-5.0, 1.5)
 SPREAD_BOUNDS = (0.01, 2.0)
 RATIO_BOUND = 3.5
-# where plain inversion tells: its variance, this many times, is below the network's (the odds grow with the ratio's
-# power), and both are apart by no more than this (ln z, standard deviation); chosen in docs/training.md
+# A network draws towards focus what is little out of it, however well its blur is read. Plain inversion tells where its
+# variance, so many times, is below the network's (odds grow with this power of their ratio), and both are hardly apart
+# (ln z, standard deviation of a normal law): docs/training.md
 PLAIN_DOUBT, PLAIN_POWER, PLAIN_APART = 6.0, 3.0, 0.1
 LUMINANCE = (0.299, 0.587, 0.114)
 GREY = 0.5
@@ -373,15 +374,15 @@ def _plane(values: Tensor, like: Tensor) -> Tensor:
     return values[:, None, None, None].expand(-1, 1, like.shape[2], like.shape[3])
 
 
-def _weighed(plain: Tensor, own: Tensor, log_spread: Tensor, log_scale: Tensor) -> Tensor:
-    """ln(z / s1): the network's own, or plain inversion where that states far less error and both nearly agree.
+def _weighed(plain: Tensor, free: Tensor, freedom: Tensor, surer: Tensor) -> Tensor:
+    """ln(z / s1): plain inversion with a share of the free estimate, or without where plain inversion tells.
 
-    A network draws towards focus what is little out of it, however well its blur is read. An error of x is one of
-    z / s1 times that in ln z, on either side (eq. 7).
+    ``surer`` is the logarithm of how far below the depth network's error that of x is, to the power: an error of x is
+    one of z / s1 times that in ln z, on either side (eq. 7).
     """
-    apart = plain - own
-    surer = 2 * (log_scale - log_spread - plain) - math.log(PLAIN_DOUBT)
-    return own + torch.sigmoid(PLAIN_POWER * surer - (apart / PLAIN_APART) ** 2 / 2) * apart
+    apart = freedom * (plain - free)
+    doubt = apart * apart * (0.5 / PLAIN_APART**2) + plain * (2 * PLAIN_POWER) - surer
+    return plain - torch.sigmoid(doubt) * apart
 
 
 class CompactBlur(nn.Module):
@@ -449,10 +450,10 @@ class CompactDepth(nn.Module):
         with torch.autocast(defocus.device.type, enabled=False):
             out = functional.conv2d(x.float(), self.head.weight, self.head.bias)
             free_near, free_far = functional.logsigmoid(-out[:, 0:1]), -functional.logsigmoid(-out[:, 1:2])
-            gate, log_scale = torch.sigmoid(out[:, 2:3]), _bounded_log_error(out[:, 4:5])
-            own_near, own_far = gate * near + (1 - gate) * free_near, gate * far + (1 - gate) * free_far
-            log_near = _weighed(near, own_near, log_spread, log_scale).clamp(-RATIO_BOUND, 0.0)
-            log_far = _weighed(far, own_far, log_spread, log_scale).clamp(0.0, RATIO_BOUND)
+            freedom, log_scale = torch.sigmoid(-out[:, 2:3]), _bounded_log_error(out[:, 4:5])
+            surer = (log_scale - log_spread) * (2 * PLAIN_POWER) - PLAIN_POWER * math.log(PLAIN_DOUBT)
+            log_near = _weighed(near, free_near, freedom, surer).clamp(-RATIO_BOUND, 0.0)
+            log_far = _weighed(far, free_far, freedom, surer).clamp(0.0, RATIO_BOUND)
         near_logit = enlarged + out[:, 3:4]
         return LaidOutEstimate(log_near, log_far, near_logit, log_scale, coarsest, layout_odds)
 
