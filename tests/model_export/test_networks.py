@@ -1,6 +1,7 @@
 """Both pairs of networks, behind one interface."""
 
 import copy
+import math
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ from torch.nn import functional
 from model_export.config import Kind, TrainConfig
 from model_export.folded import folded
 from model_export.losses import STANDING_OUT, Batch, correct, run_pair, standing_out, total_loss
-from model_export.networks import LUMINANCE, BandEnergy, Layout, Surroundings, make_pair, parameter_count
+from model_export.networks import LUMINANCE, BandEnergy, Layout, Scene, Surroundings, make_pair, parameter_count
 from model_export.render import blur
 
 KINDS: list[Kind] = ["compact", "paper"]
@@ -150,6 +151,30 @@ def test_correction_takes_the_camera_out() -> None:
     one, _ = correct(seen, 0.1 * ones, 2 * ones, 0.0)
     other, _ = correct(wider, 0.3 * ones, 6 * ones, 0.0)
     torch.testing.assert_close(one, other)
+
+
+@pytest.mark.parametrize(
+    ("x", "spread", "gate", "told"),
+    [(0.25, 0.005, 0.5, True), (0.25, 0.25, 0.5, False), (3.0, 0.05, 0.0, False)],
+    ids=["sure", "unsure", "sure and far off"],
+)
+def test_plain_inversion_tells_where_it_is_far_surer_and_hardly_apart(
+    x: float, spread: float, gate: float, *, told: bool
+) -> None:
+    """The network takes so much of it on its own, and the rest from a guess at z / s1 = 0.5 and 2."""
+    depth = make_pair("compact").depth
+    head = depth.get_submodule("head")
+    log_scale = math.log(0.1)
+    with torch.no_grad():
+        head.get_parameter("weight").zero_()
+        head.get_parameter("bias").copy_(torch.tensor([0.0, 0.0, torch.logit(torch.tensor(gate)), 0.0, log_scale]))
+    cell = torch.ones(1, 1, 16, 16)
+    one = torch.ones(1)
+    with torch.no_grad():
+        answer = depth(x * cell, spread * cell, Scene(2 * one, 500 * one, 0 * one), (torch.rand(1, 16, 16, 16),))
+    plain, guess = -math.log1p(x), -math.log(2)
+    wanted = plain if told else gate * plain + (1 - gate) * guess
+    assert answer.log_ratio_near.mean().item() == pytest.approx(wanted, abs=0.005)
 
 
 def test_the_layout_says_nothing_at_first_and_looks_far_once_it_learned() -> None:
