@@ -44,6 +44,8 @@ from service.storage.idempotency import once_of
 BODY_ERRORS = (BadRequest, UnsupportedKind)
 ETAG = {"ETag": {"description": "The revision, for If-Match", "schema": {"type": "string"}}}
 LOCATION = {"Location": {"description": "The camera's path", "schema": {"type": "string"}}}
+# another owner's camera, or another database's, has the same path and the same revision
+UNCACHED = {"Cache-Control": "no-store", "Vary": "Authorization"}
 CURVE_SPAN = 5.0
 CURVE_POINTS = 101
 REVISION_PATTERN = r"[1-9][0-9]{0,8}"
@@ -140,9 +142,10 @@ def read_camera(
 ) -> CameraRead | Response:
     """The camera at its current revision."""
     record = cameras.get(name)
+    response.headers.update(UNCACHED)
     answer = _answer(record, response)
     if _is_at_hand(record.revision, if_none_match):
-        return Response(status_code=304, headers={"ETag": response.headers["ETag"]})
+        return Response(status_code=304, headers=response.headers)
     return answer
 
 
@@ -229,7 +232,7 @@ def read_curve(
 
 def _drafted(data: bytes) -> Draft:
     header = read_header(data)
-    return draft_camera(read_exif(header.exif or data), header.width_px, header.height_px)
+    return draft_camera(read_exif(header.exif), header.width_px, header.height_px)
 
 
 def _answer(record: CameraRecord, response: Response) -> CameraRead:

@@ -80,7 +80,7 @@ def _intrinsics(
     camera = order.camera and stored_camera_of(order.camera, width_px, height_px, header.orientation)
     if camera and camera.intrinsics:
         return camera.intrinsics, "camera"
-    guess = draft_camera(read_exif(header.exif or order.data), width_px, height_px).lens
+    guess = draft_camera(read_exif(header.exif), width_px, height_px).lens
     if guess.focal_length_mm is None or guess.pixel_pitch_um is None:
         return None, None
     lens = Lens(guess.focal_length_mm, 1.0, guess.pixel_pitch_um, guess.sensor_width_px or width_px)

@@ -11,7 +11,7 @@ from service.inference.cancellation import Cancellation
 from service.inference.depth_map import DepthMap
 from service.inference.encode import ENCODERS, MEDIA_TYPES, Encoded, pixel_at, read_point, spread_of
 from service.inference.estimator import Estimator
-from service.inference.frame import camera_of, other_lens
+from service.inference.frame import camera_of, taken_otherwise
 from service.inference.images import ImageLimits, read_photograph
 from service.inference.pair import Stopwatch
 from service.inference.part import Part
@@ -63,8 +63,7 @@ def fulfil(cancellation: Cancellation, order: Order, estimator: Estimator) -> An
     with stopwatch.stage("decode"):
         photograph = read_photograph(order.upload.data, order.upload.media_type, order.limits)
     camera, resized = camera_of(photograph, order.camera)
-    lens = order.record.draft.lens
-    taken = other_lens(photograph.shot, lens) if lens else ()
+    taken = taken_otherwise(photograph.shot, order.record.draft.lens)
     part = order.query.part or Part(0, 0, photograph.width_px, photograph.height_px)
     part.require_within(photograph.width_px, photograph.height_px)
     for u, v in order.query.points:

@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from service.calibration import fit
 from service.calibration.edge import Spread, find_spread, fit_again
-from service.calibration.measure import LEAST_CIRCLES, Measured, measure
+from service.calibration.measure import LEAST_CIRCLES, Measured, measure, otherwise_sized
 from service.calibration.pose import FEW_VIEWS, Placement, PoseError, place
 from service.calibration.report import Method, PictureReport, Report, Result, Role, Sample
 from service.calibration.target import CircleGrid
@@ -158,6 +158,7 @@ def _result(task: Task, measured: list[Measured], at: Callable[[float], None]) -
         corner_ratio=corners,
         warnings=(
             *_left_out(measured, usable),
+            *otherwise_sized(usable),
             *placement.warnings,
             *constants.warnings,
             *_uneven(corners),

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from service.calibration.measure import CLIPPED_LEVEL, Measured, measure
+from service.calibration.measure import CLIPPED_LEVEL, Measured, measure, otherwise_sized
 from service.calibration.pose import View, stand
 from service.calibration.report import PictureReport
 from service.calibration.target import CircleGrid
@@ -84,7 +84,7 @@ def look(
         tilt_deg=tilt_deg,
         exposure=_exposure(seen.paper_levels),
         paper_level=float(np.median(seen.paper_levels)) / WHITE_LEVEL,
-        warnings=seen.report.warnings,
+        warnings=(*seen.report.warnings, *otherwise_sized([seen])),
     )
 
 

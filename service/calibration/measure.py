@@ -1,7 +1,7 @@
 """One photograph of the sheet measured: its grid found, and the blur of each circle read."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,6 +17,7 @@ from service.optics.light import decode_srgb
 
 LEAST_CIRCLES = 8
 CLIPPED_LEVEL = 252
+OTHER_SIZE = 1.1  # paper shrinks and ink spreads less
 PAPER_FROM_RADII, PAPER_TO_RADII = 1.3, 1.6
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 
@@ -42,6 +43,22 @@ class Measured:
 
     def warn(self, words: str) -> None:
         self.report = replace(self.report, warnings=(*self.report.warnings, words))
+
+
+def otherwise_sized(measured: Sequence[Measured]) -> tuple[str, ...]:
+    """A warning where circles are larger or smaller, beside what is between them, than the grid was told to have."""
+    ratios = [
+        edge.radius_px / one.grid.radii_px[circle]
+        for one in measured
+        if one.grid
+        for circle, edge in zip(one.circles, one.edges, strict=True)
+    ]
+    if not ratios or 1 / OTHER_SIZE <= (ratio := float(np.median(ratios))) <= OTHER_SIZE:
+        return ()
+    return (
+        f"the circles are {ratio:.3g} times as large, beside what is between them, as was told: one of spacing_mm and "
+        "diameter_mm is not the sheet's, and metres follow spacing_mm",
+    )
 
 
 def measure(

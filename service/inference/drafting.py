@@ -6,21 +6,23 @@ the sensor is, as a last resort.
 
 import math
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
 import lensfunpy
 
 from service.inference.exif import Exif
+from service.inference.frame import MOST_ZOOM
 from service.optics import thin_lens
 
 FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
 SENSOR_WIDTHS_MM = (1.0, 70.0)
 FOCUS_DISTANCES_M = (0.001, 100_000.0)
-MOST_ZOOM = 1.01
 # of the long side to the short one; others are cut out of one of these
 SENSOR_ASPECTS = (4 / 3, 3 / 2)
 ASPECT_TOLERANCE = 0.02
+SAME_WIDTH = 1.25  # a square cut out of 4:3 is taken for wider by less, a sensor's part or another lens by more
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +102,8 @@ def _sensor(exif: Exif, width_px: int, aspect: float, warnings: list[str]) -> tu
     A picture that says nothing of its width in the camera may be a small copy: then its own width is no sensor's, but
     where it says how wide a pixel is. Where the sensor's width in mm is known any such pair is as good.
     """
-    sensor_width_px = exif.width_px if exif.width_px and exif.width_px >= width_px else None
+    stated_px = _stated_width_px(exif, aspect)
+    sensor_width_px = stated_px if stated_px and stated_px >= width_px else None
     if sensor_width_px not in (None, width_px):
         warnings.append(
             f"EXIF says {sensor_width_px} pixels wide and the file has {width_px}: taken as resized; a crop would "
@@ -117,28 +120,66 @@ def _sensor(exif: Exif, width_px: int, aspect: float, warnings: list[str]) -> tu
     return round(1e3 * width_mm / sensor_width_px / _zoom(exif), 4) or None, sensor_width_px
 
 
+def _stated_width_px(exif: Exif, aspect: float) -> int | None:
+    """The width the picture had in the camera; who turns pixels upright may leave its EXIF as it was."""
+    width_px, height_px = exif.width_px, exif.height_px
+    if not width_px or not height_px or width_px == height_px:
+        return width_px
+    is_turned = math.isclose(height_px / width_px, aspect, rel_tol=ASPECT_TOLERANCE)
+    return height_px if is_turned else width_px
+
+
 def _sensor_width_mm(exif: Exif, sensor_width_px: int | None, aspect: float, warnings: list[str]) -> float | None:
-    """From the pixel pitch, else the camera's known crop factor, else the two focal lengths; the surest first."""
+    """The surest width that the roughest agrees with, which follows the lens where a copy's or a list's may not.
+
+    Of a zoomed picture the surest: some equivalents count the zoom, and some do not.
+    """
+    found = list(_sensor_widths_mm(exif, sensor_width_px, aspect, warnings))
+    if not found:
+        return None
+    roughest_mm = found[0 if _zoom(exif) > MOST_ZOOM else -1][0]
+    width_mm, told = next(one for one in found if _is_about(one[0], roughest_mm))
+    if others := ", ".join(f"{other_mm:.3g}" for other_mm, _ in found if not _is_about(other_mm, width_mm)):
+        warnings.append(
+            f"the sensor is taken as {width_mm:.3g} mm wide, where the EXIF or a list of cameras also says {others}: "
+            "check lens.pixel_pitch_um"
+        )
+    warnings.extend(told)
+    return width_mm
+
+
+def _is_about(width_mm: float, other_mm: float) -> bool:
+    return max(width_mm, other_mm) <= SAME_WIDTH * min(width_mm, other_mm)
+
+
+def _sensor_widths_mm(
+    exif: Exif, sensor_width_px: int | None, aspect: float, warnings: list[str]
+) -> Iterator[tuple[float, tuple[str, ...]]]:
+    """From the pixel pitch, the camera's known crop factor, the two focal lengths, each with what to know of it."""
     if exif.focal_plane_pitch_um and sensor_width_px:
         width_mm = exif.focal_plane_pitch_um * sensor_width_px / 1e3
         if SENSOR_WIDTHS_MM[0] <= width_mm <= SENSOR_WIDTHS_MM[1]:
-            return width_mm
-        warnings.append(f"its EXIF makes the sensor {width_mm:.3g} mm wide, which cannot be, and was not believed")
-    crop = _known_crop(exif.make or "", exif.model or "")
-    if crop is not None:
-        warnings.append(f"the sensor's size is that of a crop factor of {crop:.4g}, from a list of cameras")
-    elif exif.focal_length_35mm and exif.focal_length_mm:
-        crop = exif.focal_length_35mm / exif.focal_length_mm / _zoom(exif)
-        warnings.append(
+            yield width_mm, ()
+        else:
+            warnings.append(f"its EXIF makes the sensor {width_mm:.3g} mm wide, which cannot be, and was not believed")
+    is_whole = any(math.isclose(max(aspect, 1 / aspect), known, rel_tol=ASPECT_TOLERANCE) for known in SENSOR_ASPECTS)
+    shape = () if is_whole else ("the picture is neither 4:3 nor 3:2: the sensor may be larger than the frame it took",)
+    crops: list[tuple[float | None, str]] = [
+        (
+            _known_crop(exif.make or "", exif.model or ""),
+            "the sensor's size is that of a crop factor of {:.4g}, from a list of cameras",
+        )
+    ]
+    if exif.focal_length_35mm and exif.focal_length_mm:
+        words = (
             f"the sensor's size follows from the 35-mm equivalent, {exif.focal_length_35mm:g} mm for "
             f"{exif.focal_length_mm:g}, which is rounded: k_cam may be off by some percent"
         )
-    else:
-        return None
-    if not any(math.isclose(max(aspect, 1 / aspect), known, rel_tol=ASPECT_TOLERANCE) for known in SENSOR_ASPECTS):
-        warnings.append("the picture is neither 4:3 nor 3:2: the sensor may be larger than the frame it took")
-    width_mm = FULL_FRAME_DIAGONAL_MM / crop * aspect / math.hypot(aspect, 1)
-    return width_mm if SENSOR_WIDTHS_MM[0] <= width_mm <= SENSOR_WIDTHS_MM[1] else None
+        crops.append((exif.focal_length_35mm / exif.focal_length_mm / _zoom(exif), words))
+    for crop, words in crops:
+        width_mm = FULL_FRAME_DIAGONAL_MM / (crop or math.inf) * aspect / math.hypot(aspect, 1)
+        if crop and SENSOR_WIDTHS_MM[0] <= width_mm <= SENSOR_WIDTHS_MM[1]:
+            yield width_mm, (words.format(crop), *shape)
 
 
 @lru_cache(maxsize=256)

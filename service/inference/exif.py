@@ -1,20 +1,18 @@
 """What a photograph's EXIF says of lens and sensor. Nothing else in it is looked at, least of all the position."""
 
-import logging
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass
-from io import BytesIO
+import struct
+from dataclasses import dataclass, replace
 
-import exifread
-import structlog
-from exifread.core.ifd_tag import IfdTag
+from service.errors import InvalidImage
+from service.inference.headers import TiffDirectory, exif_directories
 
+MAKE, MODEL = 271, 272
+F_NUMBER, FOCAL_LENGTH, SUBJECT_DISTANCE = 0x829D, 0x920A, 0x9206
+WIDTH, HEIGHT, PLANE_RESOLUTION, PLANE_UNIT = 0xA002, 0xA003, 0xA20E, 0xA210
+DIGITAL_ZOOM, FOCAL_LENGTH_35MM, LENS_MODEL = 0xA404, 0xA405, 0xA434
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 MOST_TEXT = 64
-
-logging.getLogger("exifread").setLevel(logging.CRITICAL)
-log = structlog.stdlib.get_logger("camind.exif")
+INFINITY = 2**32 - 1  # all ones, in a distance
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,52 +28,48 @@ class Exif:
     subject_distance_m: float | None = None
     digital_zoom: float | None = None
     width_px: int | None = None
+    height_px: int | None = None
     focal_plane_pitch_um: float | None = None
 
 
-def read_exif(data: bytes) -> Exif:
-    """The EXIF of a photograph's file, or of the block in it; empty where there is none, or none that can be read."""
+def read_exif(exif: bytes) -> Exif:
+    """The tags of an EXIF block (``Header.exif``); empty where there is none, or none that can be read."""
     try:
-        tags = exifread.process_file(BytesIO(data), details=False, extract_thumbnail=False)
-    except Exception as exc:  # its readers raise whatever a damaged file makes of their indices
-        log.debug("exif_unreadable", cause=type(exc).__name__)
+        main, shot = exif_directories(exif)
+        body = Exif(make=_text(main, MAKE), model=_text(main, MODEL))
+        return body if shot is None else _with_shot(body, shot)
+    except (struct.error, InvalidImage):
         return Exif()
-    found = {name: tag for name, tag in tags.items() if isinstance(tag, IfdTag)}
-    width = _number(found, "EXIF ExifImageWidth")
-    return Exif(
-        make=_text(found, "Image Make"),
-        model=_text(found, "Image Model"),
-        lens=_text(found, "EXIF LensModel"),
-        focal_length_mm=_number(found, "EXIF FocalLength"),
-        focal_length_35mm=_number(found, "EXIF FocalLengthIn35mmFilm"),
-        f_number=_number(found, "EXIF FNumber"),
-        subject_distance_m=_number(found, "EXIF SubjectDistance"),
-        digital_zoom=_number(found, "EXIF DigitalZoomRatio"),
+
+
+def _with_shot(body: Exif, shot: TiffDirectory) -> Exif:
+    width, height = _number(shot, WIDTH), _number(shot, HEIGHT)
+    return replace(
+        body,
+        lens=_text(shot, LENS_MODEL),
+        focal_length_mm=_number(shot, FOCAL_LENGTH),
+        focal_length_35mm=_number(shot, FOCAL_LENGTH_35MM),
+        f_number=_number(shot, F_NUMBER),
+        subject_distance_m=_number(shot, SUBJECT_DISTANCE),
+        digital_zoom=_number(shot, DIGITAL_ZOOM),
         width_px=int(width) if width else None,
-        focal_plane_pitch_um=_pitch_um(found),
+        height_px=int(height) if height else None,
+        focal_plane_pitch_um=_pitch_um(shot),
     )
 
 
-def _pitch_um(tags: Mapping[str, IfdTag]) -> float | None:
-    pixels_per_unit = _number(tags, "EXIF FocalPlaneXResolution")
-    unit = _number(tags, "EXIF FocalPlaneResolutionUnit") or 2
+def _pitch_um(shot: TiffDirectory) -> float | None:
+    pixels_per_unit, unit = _number(shot, PLANE_RESOLUTION), _number(shot, PLANE_UNIT) or 2
     if pixels_per_unit is None or unit not in MM_PER_UNIT:
         return None
     return 1e3 * MM_PER_UNIT[int(unit)] / pixels_per_unit
 
 
-def _number(tags: Mapping[str, IfdTag], name: str) -> float | None:
-    values = tags[name].values if name in tags else None
-    value = values[0] if isinstance(values, list) and values else math.nan
-    try:
-        # what is stored as a floating-point number comes in a tuple
-        number = float(value[0] if isinstance(value, tuple) else value)
-    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
-        return None
-    # all ones stand for infinity in a distance
-    return number if 0 < number < 2**32 - 1 else None
+def _number(directory: TiffDirectory, tag: int) -> float | None:
+    number = directory.number(tag)
+    return number if number is not None and number < INFINITY else None
 
 
-def _text(tags: Mapping[str, IfdTag], name: str) -> str | None:
-    text = "".join(letter for letter in str(tags[name]) if letter.isprintable()) if name in tags else ""
+def _text(directory: TiffDirectory, tag: int) -> str | None:
+    text = "".join(letter for letter in directory.text(tag) if letter.isprintable())
     return text.strip()[:MOST_TEXT] or None

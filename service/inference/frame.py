@@ -6,6 +6,7 @@ from service.inference.images import TURNS, Photograph
 from service.optics.camera import Camera, Lens
 
 LENS_TOLERANCE = 0.05
+MOST_ZOOM = 1.01
 UNTURNS = {orientation: {6: 8, 8: 6}.get(orientation, orientation) for orientation in TURNS}
 
 
@@ -44,8 +45,14 @@ def camera_of(photograph: Photograph, camera: Camera) -> tuple[Camera, tuple[str
     return resized, (warning,)
 
 
-def other_lens(shot: Shot, lens: Lens) -> tuple[str, ...]:
-    """A warning where a photograph was not taken with the camera's lens as registered; nothing where all is alike."""
+def taken_otherwise(shot: Shot, lens: Lens | None) -> tuple[str, ...]:
+    """Warnings where a photograph was zoomed, or not taken with the camera's lens as registered."""
+    zoom = shot.digital_zoom or 1.0
+    zoomed = f"its EXIF says a digital zoom of {zoom:.4g}: the metres hold for a camera registered at that zoom alone"
+    return (*((zoomed,) if zoom > MOST_ZOOM else ()), *(_other_lens(shot, lens) if lens else ()))
+
+
+def _other_lens(shot: Shot, lens: Lens) -> tuple[str, ...]:
     told = ((shot.focal_length_mm, lens.focal_length_mm, "{:g} mm"), (shot.f_number, lens.f_number, "f/{:g}"))
     known = [(theirs, ours, form) for theirs, ours, form in told if theirs is not None]
     if all(abs(theirs / ours - 1) <= LENS_TOLERANCE for theirs, ours, _ in known):

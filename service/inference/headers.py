@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from service.errors import InvalidImage, UnsupportedKind
-from service.inference.heic import primary_picture
+from service.inference.heic import exif_item, primary_picture
 
 Kind = Literal["jpeg", "png", "tiff", "webp", "heic", "raw"]
 
@@ -37,7 +37,8 @@ MOST_DIRECTORIES = 16
 TIFF_TYPES = {1: "B", 3: "H", 4: "I", 13: "I"}
 # with those that are no whole numbers: a rational is two
 TIFF_NUMBERS = {**TIFF_TYPES, 5: "II", 11: "f", 12: "d"}
-EXIF_DIRECTORY, EXIF_F_NUMBER, EXIF_FOCAL_LENGTH = 34665, 33437, 37386
+TIFF_TEXT, TIFF_MOST_TEXT = 2, 256
+EXIF_DIRECTORY, EXIF_F_NUMBER, EXIF_FOCAL_LENGTH, EXIF_DIGITAL_ZOOM = 34665, 33437, 37386, 41988
 TIFF_MAX_VALUES = 100_000
 TIFF_MAX_ENTRIES = 4_096
 TIFF_TILE_SIZE = (322, 323)
@@ -51,7 +52,7 @@ MOST_SCANS = 64
 class Header:
     """Stored size in pixels, before orientation (EXIF, 1..8) is applied; ``exif`` is the EXIF, without a signature.
 
-    Of a tiff or raw file that is the file; of a HEIC it is not looked for. ``has_more``: other pages or frames follow.
+    Of a tiff or raw file that is the file. ``has_more``: other pages or frames follow.
     """
 
     kind: Kind
@@ -65,10 +66,11 @@ class Header:
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """What the lens was set to; None for what is not told."""
+    """What lens and camera were set to; None for what is not told."""
 
     focal_length_mm: float | None = None
     f_number: float | None = None
+    digital_zoom: float | None = None
 
 
 def sniff(data: bytes) -> Kind | None:
@@ -219,7 +221,7 @@ def _webp_size(name: bytes, payload: bytes) -> tuple[int, int] | None:
 
 
 def _tiff(data: bytes) -> Header:
-    directory = _TiffDirectory(data)
+    directory = TiffDirectory(data)
     directory.require_stored()
     sensor = _sensor_size(data, directory)
     if sensor is not None:
@@ -233,16 +235,16 @@ def _tiff(data: bytes) -> Header:
     return Header("tiff", *directory.size, directory.orientation(), at, data, _has_more_pages(data, directory))
 
 
-def _has_more_pages(data: bytes, first: "_TiffDirectory") -> bool:
+def _has_more_pages(data: bytes, first: "TiffDirectory") -> bool:
     """Whether pages follow; a smaller copy of the first is none."""
     try:
-        pages = [_TiffDirectory(data, start) for start in first.following(MOST_DIRECTORIES)]
+        pages = [TiffDirectory(data, start) for start in first.following(MOST_DIRECTORIES)]
         return not all(1 & next(iter(page.values(TIFF_NEW_SUBFILE)), 0) for page in pages)
     except (struct.error, InvalidImage):
         return False
 
 
-def _require_tiles(directory: "_TiffDirectory") -> None:
+def _require_tiles(directory: "TiffDirectory") -> None:
     """Tiles far larger than the picture, which a decoder makes room for, mean harm."""
     width, height = directory.size
     across, down = (next(iter(directory.values(tag)), 0) for tag in TIFF_TILE_SIZE)
@@ -250,10 +252,10 @@ def _require_tiles(directory: "_TiffDirectory") -> None:
         raise InvalidImage(f"The tiff file states tiles of {across}x{down} pixels for {width}x{height} pixels.")
 
 
-def _sensor_size(data: bytes, first: "_TiffDirectory") -> tuple[int, int] | None:
+def _sensor_size(data: bytes, first: "TiffDirectory") -> tuple[int, int] | None:
     """The size of the largest picture where the file holds a sensor's values, None for any other tiff."""
     starts = [*first.values(TIFF_SUB_DIRECTORIES)[:MOST_DIRECTORIES], *first.following(MOST_DIRECTORIES)]
-    directories = [first, *(_TiffDirectory(data, start) for start in starts)]
+    directories = [first, *(TiffDirectory(data, start) for start in starts)]
     is_raw = data[8:10] == CR2_MARK or first.offset_of(TIFF_DNG_VERSION) is not None
     if not is_raw and not any(TIFF_SENSOR & {*each.values(TIFF_PHOTOMETRIC)} for each in directories):
         return None
@@ -263,30 +265,35 @@ def _sensor_size(data: bytes, first: "_TiffDirectory") -> tuple[int, int] | None
 
 
 def _heic(data: bytes) -> Header:
-    return Header("heic", *primary_picture(data))
+    return Header("heic", *primary_picture(data), exif=exif_item(data))
 
 
 def _exif_orientation(data: bytes) -> int:
     """Orientation 1..8 from an EXIF block; a block that cannot be read says nothing, which is 1."""
     try:
-        return _TiffDirectory(data).orientation()
+        return TiffDirectory(data).orientation()
     except (struct.error, InvalidImage):
         return 1
 
 
 def read_shot(exif: bytes) -> Shot:
-    """What an EXIF block says of the lens, two numbers at most; one that cannot be read says nothing."""
+    """What an EXIF block says of a shot, three numbers at most; one that cannot be read says nothing."""
     try:
-        start = next(iter(_TiffDirectory(exif).values(EXIF_DIRECTORY)), None)
-        if start is None:
-            return Shot()
-        directory = _TiffDirectory(exif, start)
-        return Shot(directory.number(EXIF_FOCAL_LENGTH), directory.number(EXIF_F_NUMBER))
+        _, shot = exif_directories(exif)
+        tags = (EXIF_FOCAL_LENGTH, EXIF_F_NUMBER, EXIF_DIGITAL_ZOOM)
+        return Shot(*(shot.number(tag) for tag in tags)) if shot else Shot()
     except (struct.error, InvalidImage):
         return Shot()
 
 
-class _TiffDirectory:
+def exif_directories(exif: bytes) -> "tuple[TiffDirectory, TiffDirectory | None]":
+    """The main directory of an EXIF block and that of the shot; ``InvalidImage`` or ``struct.error`` for no such."""
+    main = TiffDirectory(exif)
+    start = next(iter(main.values(EXIF_DIRECTORY)), None)
+    return main, None if start is None else TiffDirectory(exif, start)
+
+
+class TiffDirectory:
     """A directory of a TIFF structure, the form of EXIF too: the first, or the one at ``start``."""
 
     def __init__(self, data: bytes, start: int | None = None) -> None:
@@ -338,7 +345,7 @@ class _TiffDirectory:
         if entry is None:
             return None
         kind, count = self._unpack("HI", entry + 2)
-        size = struct.calcsize("=" + TIFF_NUMBERS.get(kind, "I")) * count
+        size = struct.calcsize("=" + ("s" if kind == TIFF_TEXT else TIFF_NUMBERS.get(kind, "I"))) * count
         return entry + 8 if size <= 4 else self._unpack("I", entry + 8)[0]
 
     def values(self, tag: int) -> tuple[int, ...]:
@@ -364,6 +371,14 @@ class _TiffDirectory:
         over, *under = self._unpack(TIFF_NUMBERS[kind], at)
         value = over / (under[0] or math.nan) if under else over
         return value if 0 < value < math.inf else None
+
+    def text(self, tag: int) -> str:
+        """A tag's text up to its end; empty without one."""
+        at = self.offset_of(tag)
+        kind, count = (0, 0) if at is None else self._unpack("HI", self._entries[tag] + 2)
+        if at is None or kind != TIFF_TEXT:
+            return ""
+        return self._data[at : at + min(count, TIFF_MOST_TEXT)].partition(b"\0")[0].decode("utf-8", "ignore")
 
     def orientation(self) -> int:
         value = next(iter(self.values(TIFF_ORIENTATION)), 1)

@@ -1,7 +1,8 @@
-"""What a HEIC's boxes say of its primary picture: the size and the turn that its decoder applies."""
+"""What a HEIC's boxes say of its primary picture: the size and the turn that its decoder applies; and its EXIF."""
 
 import struct
 from collections.abc import Iterator
+from io import BytesIO
 from itertools import islice
 
 from service.errors import InvalidImage
@@ -54,6 +55,55 @@ def primary_picture(data: bytes) -> tuple[int, int, int]:
             corners = _moved(corners, LEFT_TO_RIGHT if data[at] & 1 else TOP_TO_BOTTOM)
     orientation = ORIENTATIONS[corners]
     return (height, width, orientation) if orientation >= 5 else (width, height, orientation)
+
+
+def exif_item(data: bytes) -> bytes:
+    """The EXIF of a file that ``primary_picture`` takes, without a signature; empty where none can be found.
+
+    Boxes and fields are those of ISO/IEC 14496-12, 8.11.3 and 8.11.6, and ISO/IEC 23008-12, A.2.1.
+    """
+    try:
+        start, end = next((start, end) for name, start, end in _boxes(data, 0, len(data)) if name == b"meta")
+        inner = {name: (start, end) for name, start, end in _boxes(data, start + 4, end)}
+        item = _item_of_kind(data, *inner[b"iinf"], b"Exif")
+        at, length = _place(data, inner[b"iloc"][0], item)
+        (skipped,) = struct.unpack_from(">I", data, at)
+        return data[at + 4 + skipped : at + length]
+    except (StopIteration, LookupError, OverflowError, struct.error, InvalidImage):
+        return b""
+
+
+def _item_of_kind(data: bytes, at: int, end: int, kind: bytes) -> int:
+    """The number of the first item of a kind; ``LookupError`` without one."""
+    for _, start, _ in _boxes(data, at + (8 if data[at] else 6), end):
+        form = {2: ">HH4s", 3: ">IH4s"}.get(data[start])
+        if form:
+            item, _, stated = struct.unpack_from(form, data, start + 4)
+            if stated == kind:
+                return int(item)
+    raise LookupError(kind)
+
+
+def _place(data: bytes, at: int, item: int) -> tuple[int, int]:
+    """Where in the file an item's first extent begins, and its length; ``LookupError`` where it is not in the file."""
+    version, sizes = data[at], struct.unpack_from(">H", data, at + 4)[0]
+    offset_size, length_size, base_size, index_size = (sizes >> shift & 15 for shift in (12, 8, 4, 0))
+    stream = BytesIO(data)
+    stream.seek(at + 6)
+
+    def number(size: int) -> int:
+        return int.from_bytes(stream.read(size), "big")
+
+    id_size, index_size = 4 if version == 2 else 2, index_size if version else 0
+    for _ in range(min(number(id_size), MOST_BOXES)):
+        found, method = number(id_size), number(2) & 15 if version else 0
+        number(2)  # of another file, which nothing here is in
+        base, extents = number(base_size), number(2)
+        if found == item and method == 0 and extents:
+            number(index_size)
+            return base + number(offset_size), number(length_size)
+        stream.seek(extents * (index_size + offset_size + length_size), 1)
+    raise LookupError(item)
 
 
 def _cut_off() -> InvalidImage:

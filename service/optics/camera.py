@@ -72,6 +72,8 @@ class Intrinsics:
         ``size_px`` is the width and height after the transposition. Tangential and thin-prism terms turn with
         the picture; tilt terms (beyond the twelfth) have no turned form and are left out.
         """
+        if not (transposed or flip_u or flip_v):
+            return self
         fx_px, fy_px, cx_px, cy_px = self.fx_px, self.fy_px, self.cx_px, self.cy_px
         terms = list(self.distortion[:12])
         if transposed:

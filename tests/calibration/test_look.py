@@ -1,5 +1,7 @@
 """A look at one photograph of the sheet: a few circles stand for all of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -25,6 +27,20 @@ def test_the_blur_of_a_few_circles_is_that_of_all(sheet: CircleGrid) -> None:
     seen = look(taken, sheet, None)
     assert 0.6 * MOST_MEASURED <= seen.measured <= MOST_MEASURED
     assert seen.blur_px == pytest.approx(np.median(whole.blur_px()), rel=0.04)
+
+
+@pytest.mark.parametrize("sheet", SHEETS, ids=lambda sheet: sheet.kind)
+@pytest.mark.parametrize("wrong", ["spacing_mm", "diameter_mm", None])
+def test_a_sheet_whose_circles_are_not_as_told_beside_their_spacing_is_noticed(
+    sheet: CircleGrid, wrong: str | None
+) -> None:
+    rng = np.random.default_rng(3)
+    taken = photograph(rng, CAMERA, draw_pose(rng, CAMERA, sheet, 0.42), sheet, focused=False)
+    told = (
+        replace(sheet, **{wrong: getattr(sheet, wrong) * (1.41 if wrong == "spacing_mm" else 0.71)}) if wrong else sheet
+    )
+    said = [warning for warning in look(taken, told, None).warnings if "one of spacing_mm and diameter_mm" in warning]
+    assert [" 1.4" in warning for warning in said] == [True] * bool(wrong)
 
 
 def test_a_look_stops_while_it_searches_for_the_sheet() -> None:

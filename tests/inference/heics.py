@@ -34,8 +34,13 @@ def heic(
     *,
     stated: tuple[int, int] = (64, 64),
     crop: bytes | None = CROP,
+    exif: bytes = b"",
+    version: int = 0,
 ) -> bytes:
-    """``corners()``, turned to the left by quarters and then mirrored by whoever decodes it."""
+    """``corners()``, turned to the left by quarters and then mirrored by whoever decodes it.
+
+    EXIF, if any, is listed in a table of places of that version.
+    """
     properties = [box(b"hvcC", HVCC), whole(b"ispe", struct.pack(">II", *stated))]
     if crop is not None:
         properties.append(box(b"clap", crop))
@@ -46,14 +51,25 @@ def heic(
     links = bytes([len(properties), *(0x80 | number for number in range(1, len(properties) + 1))])
     kind = box(b"ftyp", b"heic", bytes(4), b"mif1heic")
 
+    told = bytes(4) + exif
+    items = [(b"hvc1", CODED), *([(b"Exif", told)] if exif else [])]
+
     def meta(offset: int) -> bytes:
+        number = ">I" if version == 2 else ">H"
+        places, names = [], []
+        for item, (name, stored) in enumerate(items, 1):
+            method = b"" if version == 0 else bytes(2)
+            at = struct.pack(">HII", 1, offset, len(stored))
+            places.append(struct.pack(number, item) + method + bytes(2) + at)
+            names.append(whole(b"infe", struct.pack(">HH", item, 0), name, b"\0", version=2))
+            offset += len(stored)
         return whole(
             b"meta",
             whole(b"hdlr", bytes(4), b"pict", bytes(13)),
             whole(b"pitm", struct.pack(">H", 1)),
-            whole(b"iloc", struct.pack(">BBHHHHII", 0x44, 0, 1, 1, 0, 1, offset, len(CODED))),
-            whole(b"iinf", struct.pack(">H", 1), whole(b"infe", struct.pack(">HH", 1, 0), b"hvc1", b"\0", version=2)),
+            whole(b"iloc", bytes([0x44, 0]), struct.pack(number, len(items)), *places, version=version),
+            whole(b"iinf", struct.pack(">H", len(items)), *names),
             box(b"iprp", box(b"ipco", *properties), whole(b"ipma", struct.pack(">IH", 1, 1), links)),
         )
 
-    return kind + meta(len(kind) + len(meta(0)) + 8) + box(b"mdat", CODED)
+    return kind + meta(len(kind) + len(meta(0)) + 8) + box(b"mdat", *(stored for _, stored in items))

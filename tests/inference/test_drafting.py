@@ -2,6 +2,7 @@
 
 import random
 import re
+import struct
 from dataclasses import replace
 from typing import Any
 
@@ -9,8 +10,9 @@ import pytest
 
 from service.inference.drafting import Draft, draft_camera
 from service.inference.exif import Exif, read_exif
-from service.inference.headers import read_header
+from service.inference.headers import read_header, read_shot
 from service.storage.cameras import NAME_PATTERN
+from tests.inference.heics import heic
 from tests.inference.photographs import ExifValue, corners, exif_of, jpeg, png, tiff, webp, with_exif
 
 MAKE, MODEL = 271, 272
@@ -18,7 +20,7 @@ F_NUMBER, FOCAL, SUBJECT, WIDTH, FOCAL_35, ZOOM, LENS = 0x829D, 0x920A, 0x9206, 
 PLANE_RESOLUTION, PLANE_UNIT = 0xA20E, 0xA210
 NIKON = {MAKE: "NIKON CORPORATION", MODEL: "NIKON D200"}
 SHOT: dict[int, ExifValue] = {F_NUMBER: (28, 10), FOCAL: (350, 10), FOCAL_35: 52, WIDTH: 3872}
-D200 = Exif("NIKON CORPORATION", "NIKON D200", None, 35.0, 52.0, 2.8, None, None, 3872, None)
+D200 = Exif("NIKON CORPORATION", "NIKON D200", None, 35.0, 52.0, 2.8, None, None, 3872, None, None)
 
 
 def draft(width_px: int = 3872, height_px: int = 2592, /, **tags: Any) -> Draft:
@@ -31,11 +33,25 @@ def said(drafted: Draft, *words: str) -> bool:
 
 def test_tags_are_read_from_a_jpeg_s_exif() -> None:
     shot = SHOT | {SUBJECT: (2000, 1000), ZOOM: (1, 1), LENS: "35mm f/2", PLANE_RESOLUTION: (4164, 1), PLANE_UNIT: 3}
-    found = read_exif(with_exif(jpeg(corners()), exif_of(NIKON, shot)))
+    found = read_exif(read_header(with_exif(jpeg(corners()), exif_of(NIKON, shot))).exif)
     assert replace(found, focal_plane_pitch_um=None) == replace(
         D200, lens="35mm f/2", subject_distance_m=2.0, digital_zoom=1.0
     )
     assert found.focal_plane_pitch_um == pytest.approx(1e4 / 4164)
+
+
+@pytest.mark.parametrize("version", [0, 1, 2])
+def test_tags_are_read_from_a_heic(version: int) -> None:
+    found = read_header(heic(exif=exif_of(NIKON, SHOT), version=version))
+    assert read_exif(found.exif) == D200
+    assert read_shot(found.exif).focal_length_mm == 35.0
+
+
+def test_a_list_of_items_in_a_heic_that_leads_back_to_itself_is_left() -> None:
+    endless = heic(exif=exif_of(NIKON, SHOT)).replace(b"infe", b"free")
+    for size in range(2):
+        stuck = re.sub(rb"....free", struct.pack(">I", size) + b"free", endless, count=1, flags=re.DOTALL)
+        assert read_exif(read_header(stuck).exif) == Exif()
 
 
 @pytest.mark.parametrize("prefix", [b"", b"Exif\x00\x00"])
@@ -45,20 +61,21 @@ def test_tags_are_read_from_a_webp_of_either_form(prefix: bytes) -> None:
 
 
 def test_numbers_with_a_floating_point_are_read() -> None:
-    found = read_exif(with_exif(jpeg(corners()), exif_of({}, {F_NUMBER: 1.8, FOCAL: 35.0, SUBJECT: 2.5, ZOOM: 1.0})))
+    found = read_exif(exif_of({}, {F_NUMBER: 1.8, FOCAL: 35.0, SUBJECT: 2.5, ZOOM: 1.0}))
     assert (found.f_number, found.focal_length_mm, found.subject_distance_m, found.digital_zoom) == (1.8, 35, 2.5, 1)
 
 
-@pytest.mark.parametrize("data", [b"", b"x", jpeg(corners()), png(corners()), tiff(corners()), webp(corners())])
+@pytest.mark.parametrize("data", [jpeg(corners()), png(corners()), tiff(corners()), webp(corners()), heic()])
 def test_without_exif_there_are_no_tags(data: bytes) -> None:
-    found = read_exif(data)
+    found = read_exif(read_header(data).exif)
+    assert read_exif(b"x") == Exif()
     assert (found.make, found.focal_length_mm, found.f_number, found.focal_plane_pitch_um) == (None,) * 4
 
 
 @pytest.mark.parametrize("value", [(0, 1), (0, 0), (5, 0), (2**32 - 1, 1)])
 def test_a_number_that_means_unknown_is_none(value: tuple[int, int]) -> None:
     shot = {F_NUMBER: value, SUBJECT: value, FOCAL: value, PLANE_RESOLUTION: value}
-    found = read_exif(with_exif(jpeg(corners()), exif_of({}, shot)))
+    found = read_exif(exif_of({}, shot))
     assert (found.f_number, found.subject_distance_m, found.focal_length_mm) == (None, None, None)
 
 
@@ -75,6 +92,29 @@ def test_the_pixel_pitch_of_the_exif_comes_first() -> None:
     drafted = draft(focal_plane_pitch_um=6.05)
     assert drafted.lens.pixel_pitch_um == 6.05
     assert not said(drafted, "crop")
+
+
+@pytest.mark.parametrize(
+    ("tags", "width_mm"),
+    [
+        ({"focal_plane_pitch_um": 1.01}, 23.6),
+        ({"make": "Nobody", "focal_plane_pitch_um": 15.0}, 23.6),
+        ({"focal_plane_pitch_um": 4.0, "focal_length_35mm": None}, 23.6),
+        ({"focal_length_35mm": 105.0}, 12.0),
+    ],
+    ids=["a copy's pitch", "a wrong pitch", "none but pitch and list", "another lens of a phone"],
+)
+def test_what_the_lens_says_of_the_sensor_is_believed_against_one_other(tags: dict[str, Any], width_mm: float) -> None:
+    drafted = draft(**tags)
+    assert drafted.lens.pixel_pitch_um == pytest.approx(width_mm * 1e3 / 3872, rel=0.05)
+    assert said(drafted, "check lens.pixel_pitch_um")
+    assert not said(draft(focal_plane_pitch_um=6.05), "check lens.pixel_pitch_um")
+
+
+def test_a_picture_whose_pixels_were_turned_is_as_wide_as_it_was_high() -> None:
+    turned = draft(2592, 3872, height_px=2592, focal_plane_pitch_um=6.05)
+    assert (turned.lens.pixel_pitch_um, turned.lens.sensor_width_px) == (6.05, 2592)
+    assert not said(turned, "resized")
 
 
 def test_a_pitch_that_cannot_be_is_not_believed() -> None:
@@ -163,7 +203,7 @@ def test_any_model_makes_a_name(model: str) -> None:
 
 
 def test_damaged_exif_harms_nobody() -> None:
-    whole = with_exif(jpeg(corners(8, 8)), exif_of(NIKON, SHOT))
+    whole = exif_of(NIKON, SHOT)
     draw = random.Random(7)
     for _ in range(300):
         damaged = bytearray(whole)

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from service.errors import ImageSizeMismatch
-from service.inference.frame import camera_of, other_lens
+from service.inference.frame import camera_of, taken_otherwise
 from service.inference.headers import Shot
 from service.inference.images import TURNS, Photograph, turned
 from service.opencv import cv2
@@ -89,7 +89,13 @@ def test_a_frame_made_larger_scales_gamma_alike() -> None:
     ],
 )
 def test_a_lens_that_is_not_the_camera_s_is_told(shot: Shot, words: str) -> None:
-    assert " ".join(other_lens(shot, Lens(50, 1.2, 6.0, 4000))) == words
+    assert " ".join(taken_otherwise(shot, Lens(50, 1.2, 6.0, 4000))) == words
+
+
+def test_a_digital_zoom_is_told_of_whatever_the_camera_was_made_from() -> None:
+    (warning,) = taken_otherwise(Shot(digital_zoom=2.0), None)
+    assert "digital zoom of 2" in warning
+    assert taken_otherwise(Shot(digital_zoom=1.0), None) == ()
 
 
 @pytest.mark.parametrize(("width", "height"), [(640, 400), (480, 640), (641, 300)])

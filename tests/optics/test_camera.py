@@ -107,3 +107,11 @@ def test_range_ends_where_a_quarter_pixel_is_ten_percent() -> None:
     near, far = camera().range_m
     assert near == 0
     assert far == pytest.approx(0.1 * 2.0 * 3.81 / 0.25)
+
+
+def test_a_lens_that_tilts_loses_its_tilt_only_in_a_picture_that_is_turned() -> None:
+    terms = tuple(0.01 * (number + 1) for number in range(14))
+    inner = Intrinsics(500, 500, 320, 240, terms)
+    assert inner.turned(False, False, False, (640, 480)).distortion == terms
+    assert inner.turned(False, True, True, (640, 480)).distortion[2:4] == (-terms[2], -terms[3])
+    assert len(inner.turned(False, True, True, (640, 480)).distortion) == 12
