@@ -11,6 +11,7 @@ from service.calibration.calibrate import Picture, Task, calibrate
 from service.calibration.fit import Interval
 from service.calibration.report import PictureReport, Report, Role
 from service.inference.images import SUFFIXES, ImageLimits, photographs_in, read_stored_frame
+from service.tables import photographs, shown
 
 REPORT = TypeAdapter(Report)
 
@@ -31,12 +32,13 @@ def pictures_in(folder: Path, limits: ImageLimits) -> list[Picture]:
 
 def _picture(path: Path, role: Role, limits: ImageLimits) -> Picture:
     name = f"{path.parent.name}/{path.name}" if path.parent.name == role else path.name
-    return Picture(name, role, lambda: read_stored_frame(path.read_bytes(), limits))
+    return Picture(shown(name), role, lambda: read_stored_frame(path.read_bytes(), limits))
 
 
 def calibrate_folder(folder: Path, task: Task, limits: ImageLimits, out: Path) -> Report:
     """Calibrate under a progress bar, print what each photograph gave, and write the report and its plot."""
     pictures = pictures_in(folder, limits)
+    out.parent.mkdir(parents=True, exist_ok=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True)) as progress:
         bar = progress.add_task(f"{len(pictures)} photographs", total=1.0)
@@ -51,12 +53,12 @@ def calibrate_folder(folder: Path, task: Task, limits: ImageLimits, out: Path) -
     if report.result is not None:
         from service.calibration.plot import as_svg
 
-        out.with_suffix(".svg").write_bytes(as_svg(report.result))
+        out.with_name(f"{out.name.removesuffix('.json')}.svg").write_bytes(as_svg(report.result))
     return report
 
 
 def _table(report: Report) -> Table:
-    table = Table("photograph", "circles", "blur px", "distance m", "tilt deg", "", box=None, pad_edge=False)
+    table = Table(photographs(), "circles", "blur px", "distance m", "tilt deg", "", box=None, pad_edge=False)
     for picture in report.pictures:
         figures = ((picture.blur_px, ".2f"), (picture.distance_m, ".3f"), (picture.tilt_deg, ".0f"))
         shown = ["" if value is None else format(value, form) for value, form in figures]

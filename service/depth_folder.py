@@ -22,6 +22,7 @@ from service.inference.estimator import Estimator
 from service.inference.images import SUFFIXES, ImageLimits, photographs_in
 from service.memory import keep_freed_memory
 from service.storage.cameras import CameraRecord
+from service.tables import photographs, shown
 
 ENDINGS = {"preview": ".jpg"}  # of the others it is their name
 
@@ -146,18 +147,18 @@ def _write(file: Path, body: bytes) -> None:
 
 
 def _print(made: Sequence[tuple[Path, Made]]) -> None:
-    depths = Table("photograph", "median m", "5 to 95 % m", "answered", "focus m", "", box=None, pad_edge=False)
-    points = Table("photograph", "u", "v", "depth m", "sigma m", "other side m", box=None, pad_edge=False)
+    depths = Table(photographs(), "median m", "5 to 95 % m", "answered", "focus m", "", box=None, pad_edge=False)
+    points = Table(photographs(), "u", "v", "depth m", "sigma m", "other side m", box=None, pad_edge=False)
     for path, one in made:
         if one.read is None:
-            depths.add_row(path.name, "", "", "", "", f"no depth: {one.remarks}")
+            depths.add_row(shown(path.name), "", "", "", "", f"no depth: {one.remarks}")
             continue
         spread = one.read.depth_m
         numbers = _metres(spread.median), f"{_metres(spread.p5)} to {_metres(spread.p95)}"
-        depths.add_row(path.name, *numbers, f"{one.read.valid_fraction:.0%}", f"{one.focus_m:.4g}", one.remarks)
+        depths.add_row(shown(path.name), *numbers, f"{one.read.valid_fraction:.0%}", f"{one.focus_m:.4g}", one.remarks)
         for at in one.read.points:
             found = map(_metres, (at.depth_m, at.sigma_m, at.depth_alt_m))
-            points.add_row(path.name, f"{at.u:g}", f"{at.v:g}", *found)
+            points.add_row(shown(path.name), f"{at.u:g}", f"{at.v:g}", *found)
     console = Console(markup=False, emoji=False)  # a file's name is no markup
     for table in (depths, points):
         if table.row_count:

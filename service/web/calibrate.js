@@ -240,7 +240,7 @@ function Recent({ items, open, onOpen }) {
  * @param {any | null} job
  * @param {number} attempt another one begins anew
  * @param {(job: any) => void} setJob
- * @param {(problem: Problem | null) => void} setProblem
+ * @param {(change: (old: Problem | null) => Problem | null) => void} setProblem
  * @param {(job: any) => void} onEnd
  */
 function useJob(job, attempt, setJob, setProblem, onEnd) {
@@ -248,6 +248,7 @@ function useJob(job, attempt, setJob, setProblem, onEnd) {
 	useEffect(() => {
 		if (live === null) return undefined;
 		const stop = new AbortController();
+		let met = /** @type {any} */ (null);
 		const follow = async () => {
 			while (!stop.signal.aborted) {
 				let waitMs = AGAIN_MS;
@@ -257,7 +258,7 @@ function useJob(job, attempt, setJob, setProblem, onEnd) {
 						onEvent: ({ data }) => {
 							const now = JSON.parse(data);
 							setJob(now);
-							setProblem(null);
+							setProblem((old) => (old === met ? null : old));
 							if (FINAL.has(now.state)) {
 								stop.abort();
 								onEnd(now);
@@ -266,10 +267,10 @@ function useJob(job, attempt, setJob, setProblem, onEnd) {
 					});
 				} catch (error) {
 					if (stop.signal.aborted) return;
-					const problem = problemOf(error);
-					setProblem(problem);
-					if ([401, 403, 404].includes(problem.status)) return;
-					waitMs = 1000 * (problem.retryAfterS ?? 1);
+					met = problemOf(error);
+					setProblem(() => met);
+					if ([401, 403, 404].includes(met.status)) return;
+					waitMs = 1000 * (met.retryAfterS ?? 1);
 				}
 				await new Promise((resolve) => setTimeout(resolve, waitMs));
 			}

@@ -171,7 +171,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 				model: answer.headers.get("Camind-Model") ?? "",
 			});
 			setReading(null);
-			setMarks([]);
+			setMarks((before) => [...before]);
 			setPhase(null);
 			announce(
 				spread

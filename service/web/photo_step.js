@@ -51,15 +51,9 @@ export function useLooks(photos, setPhotos, query) {
 	useEffect(() => {
 		if (!next || !query) return undefined;
 		const stop = new AbortController();
-		const tell = (/** @type {Partial<Photo>} */ found) =>
-			setPhotos((before) => before.map((one) => (one.id === next.id ? { ...one, look: null, problem: null, ...found, asked: query } : one)));
-		lookAt(next.file, query, stop.signal).then(
-			(look) => tell({ look }),
-			(error) => {
-				if (stop.signal.aborted) return;
-				tell({ problem: problemOf(error) });
-			},
-		);
+		const tell = (/** @type {any} */ look, /** @type {Problem | null} */ problem = null) =>
+			setPhotos((before) => before.map((one) => (one.id === next.id ? { ...one, look, problem, asked: query } : one)));
+		lookAt(next.file, query, stop.signal).then(tell, (error) => stop.signal.aborted || tell(null, problemOf(error)));
 		return () => stop.abort();
 	}, [next?.id, query]);
 }

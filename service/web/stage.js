@@ -239,7 +239,7 @@ function Marks({ size, reading, marks, measured, known }) {
 			isBelow=${reading.v < 0.85 * size.height}
 			name="reading"
 		>
-			${reading.depthM === null ? "no answer" : `${metres(reading.depthM)} ± ${metres(reading.sigmaM ?? 0, 2)}`}
+			${reading.depthM === null ? "no answer" : `${metres(reading.depthM)} ± ${metres(reading.sigmaM ?? 0)}`}
 		<//>`}
 		${to &&
 		measured !== null &&
@@ -250,7 +250,7 @@ function Marks({ size, reading, marks, measured, known }) {
 			isBelow=${from.v + to.v < 0.3 * size.height}
 			name="distance"
 		>
-			${metres(measured.distanceM)} ± ${metres(measured.sigmaM, 2)}
+			${metres(measured.distanceM)} ± ${metres(measured.sigmaM)}
 		<//>`}
 	`;
 }
@@ -286,5 +286,5 @@ function usePaintPx(stage, size) {
 /** @param {Reading} reading */
 function spoken({ u, v, depthM, sigmaM }) {
 	if (depthM === null) return `No answer at ${u}, ${v}.`;
-	return `${depthM.toFixed(3)} metres, give or take ${(sigmaM ?? 0).toFixed(2)}, at ${u}, ${v}.`;
+	return `${depthM.toFixed(3)} metres, give or take ${(sigmaM ?? 0).toFixed(3)}, at ${u}, ${v}.`;
 }

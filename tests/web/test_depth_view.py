@@ -298,7 +298,11 @@ def test_the_divider_uncovers_the_photograph(measured: Page) -> None:
     expect(measured.get_by_role("button", name="Clear points")).to_have_count(0)
 
 
-def test_another_side_or_focus_is_read_again(measured: Page, maps: Callable[..., Any]) -> None:
+def test_another_side_or_focus_is_read_again_and_so_is_what_was_measured(
+    measured: Page, maps: Callable[..., Any]
+) -> None:
+    for point in ((100, 100), (400, 300)):
+        stage(measured).click(position=place_of(stage(measured), *point))
     side = measured.get_by_role("combobox", name="Side of the plane in focus")
     focus = measured.get_by_label("Focus distance of this shot")
 
@@ -317,6 +321,7 @@ def test_another_side_or_focus_is_read_again(measured: Page, maps: Callable[...,
         picture.hover(position=place_of(picture, 322, 216))
         expect(measured.locator("[data-value=pixel]")).to_have_text("322, 216")
         assert number_in(measured, "depth") == pytest.approx(maps(query)["depth_m"][216, 322], abs=0.0006)
+        expect(measured.locator("[data-label=distance]")).to_have_text(re.compile(r"^\d\.\d{3} m ± \d\.\d{3} m$"))
 
 
 def test_what_a_tape_says_moves_the_focus_and_can_be_forgotten(
