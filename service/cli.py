@@ -13,7 +13,7 @@ from sqlalchemy import Engine
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.config import Settings, SettingsError, load_settings
-from service.errors import CamindError
+from service.errors import BadRequest, CamindError
 from service.memory import end_uncollected, lasting
 from service.principal import EVERYDAY, LOCAL, SCOPES
 
@@ -197,6 +197,8 @@ def calibrate(
     settings = _settings()
     limits = ImageLimits.of(settings)
     with _plain_failures():
+        if register is not None:
+            _require_storable(register)
         try:
             grid = CircleGrid(kind, rows, columns, spacing_mm, diameter_mm)
             report = calibrate_folder(folder, Task(grid, focus_distance_m, method), limits, out)
@@ -424,6 +426,19 @@ def _ready_engine() -> Iterator[Engine]:
         yield engine
 
 
+def _require_storable(name: str) -> None:
+    """A camera of this name will find its place in the database."""
+    from service.storage.cameras import require_name
+    from service.storage.engine import require_writable
+
+    try:
+        require_name(name)
+    except BadRequest as exc:
+        raise _failure(str(exc), WRONG_USE) from exc
+    with _ready_engine() as engine:
+        require_writable(engine)
+
+
 def _require_sound(settings: Settings) -> None:
     from service.storage.backup import database_file, require_sound, using
 
@@ -451,9 +466,15 @@ def _plain_failures() -> Iterator[None]:
     try:
         yield
     except SQLAlchemyError as exc:
-        raise _failure(f"The database cannot be used: {exc.args[0] if exc.args else exc}") from exc
+        raise _failure(f"The database cannot be used: {_reason(exc)}") from exc
     except (CamindError, ModelFolderError, SettingsError, OSError) as exc:
-        raise _failure(str(exc)) from exc
+        cause = exc.__cause__ if isinstance(exc, CamindError) and exc.status >= 500 else None
+        raise _failure(f"{exc}\n{_reason(cause)}" if cause else str(exc)) from exc
+
+
+def _reason(cause: BaseException) -> str:
+    """What a library says went wrong, in one line and without the statement it was at."""
+    return " ".join(str(cause.args[0] if cause.args else cause).split())
 
 
 def _failure(message: str, code: int = 1) -> typer.Exit:

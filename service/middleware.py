@@ -16,6 +16,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from service.api.handlers import log_fault
 from service.api.metrics import Metrics
 from service.api.problems import PROBLEM_KEY, problem_response
 from service.errors import CamindError, ReceiveTimeout, TooLarge
@@ -76,7 +77,9 @@ class ObserveRequests:
         except Exception as exc:
             if exchange.status is not None:
                 raise
-            if not isinstance(exc, CamindError):
+            if isinstance(exc, CamindError):
+                log_fault(exc)
+            else:
                 log.exception("request_failed")
                 exc = CamindError("Something went wrong here; the log has it under this X-Request-Id.")
             await problem_response(exc)(scope, receive, send)

@@ -104,7 +104,7 @@ class Runner:
             try:
                 is_done = not self._step()
             except CamindError as exc:
-                log.warning("calibrations_wait", detail=exc.detail)
+                log.warning("calibrations_wait", detail=exc.detail, cause=repr(exc.__cause__))
                 is_done = True
             except Exception:
                 log.exception("calibrations_wait")
@@ -179,7 +179,8 @@ class Runner:
             try:
                 write()
             except CamindError as exc:
-                log.warning("calibration_waits_for_the_database", detail=exc.detail)
+                cause = repr(exc.__cause__)
+                log.warning("calibration_waits_for_the_database", detail=exc.detail, cause=cause)
             else:
                 return True
             if self._stop.wait(RETRY_S):

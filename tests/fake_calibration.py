@@ -1,16 +1,22 @@
-"""A stand-in for ``calibrate`` with a fixed answer, which can be held back, told in steps, or made to fail."""
+"""A stand-in for ``calibrate`` with a fixed answer, which can be held back, told in steps, or made to fail.
+
+And a database that fails meanwhile.
+"""
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 from pydantic import JsonValue
+from sqlalchemy import Engine
 
 from service.calibration.calibrate import Picture, Task
 from service.calibration.fit import CurvePoint, Interval
 from service.calibration.report import PictureReport, Report, Result, Sample
 from service.errors import CamindError
 from service.optics.camera import Intrinsics
+from service.storage.engine import writing
 
 RESULT = Result(
     image_width_px=64,
@@ -34,6 +40,21 @@ SETTINGS: dict[str, JsonValue] = {
     "method": "edge",
     "register": False,
 }
+
+
+@contextmanager
+def without_calibrations(engine: Engine) -> Iterator[None]:
+    """The database cannot answer for its calibrations meanwhile."""
+    _rename(engine, "calibrations", "calibrations_elsewhere")
+    try:
+        yield
+    finally:
+        _rename(engine, "calibrations_elsewhere", "calibrations")
+
+
+def _rename(engine: Engine, table: str, name: str) -> None:
+    with writing(engine) as session:
+        session.connection().exec_driver_sql(f"ALTER TABLE {table} RENAME TO {name}")
 
 
 class FakeCalibration:

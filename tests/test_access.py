@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import structlog
 from fastapi import FastAPI
 from httpx2 import Response
 from sqlalchemy import Connection, Engine, event
@@ -256,6 +257,16 @@ def test_a_key_for_local_opens_what_was_made_without_keys(settings: Settings) ->
     with TestClient(app) as after:
         assert after.get("/cameras/bench", headers=bearer(app.state.keys, "local")).status_code == 200
         refused(after.get("/cameras/bench", headers=bearer(app.state.keys, "lab")), 404, "not-found")
+
+
+def test_the_log_says_why_keys_cannot_be_looked_up(client: TestClient, app: FastAPI, keys: Keys) -> None:
+    headers = bearer(keys, "lab")
+    with app.state.engine.begin() as connection:
+        connection.exec_driver_sql("DROP TABLE api_keys")
+    with structlog.testing.capture_logs() as events:
+        refused(client.get("/cameras", headers=headers), 503, "not-ready")
+    (cause,) = [event["cause"] for event in events if event["event"] == "unavailable"]
+    assert "no such table: api_keys" in cause
 
 
 def test_a_key_expires(client: TestClient, keys: Keys) -> None:

@@ -3,8 +3,10 @@
 import json
 import os
 import socket
+import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from importlib.metadata import EntryPoint, version
 from pathlib import Path
 
@@ -80,6 +82,26 @@ def test_an_unusable_database_is_said(tmp_path: Path, tiny_model_dir: Path, comm
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.parametrize("command", [("migrate",), ("cameras", "list"), ("serve", "--port", "0")])
+def test_a_database_of_a_later_version_is_said(tmp_path: Path, tiny_model_dir: Path, command: tuple[str, ...]) -> None:
+    camind(tmp_path, "migrate")
+    with closing(sqlite3.connect(tmp_path / "camind.sqlite3")) as database, database:
+        database.execute("UPDATE alembic_version SET version_num = '2099_01_01_later'")
+    done = camind(tmp_path, *command, CAMIND_MODEL_DIR=str(tiny_model_dir))
+    assert (done.returncode, done.stderr.count("Traceback")) == (1, 0)
+    assert "at schema 2099_01_01_later, which this version does not know" in done.stderr
+
+
+@pytest.mark.parametrize("command", [("migrate",), ("cameras", "list")])
+def test_why_a_server_is_not_reached_is_said_without_its_password(tmp_path: Path, command: tuple[str, ...]) -> None:
+    done = camind(tmp_path, *command, CAMIND_DATABASE_URL="postgresql+psycopg://u:hunter2@127.0.0.1:1/x")
+    assert done.returncode == 1
+    verdict, reason = done.stderr.splitlines()
+    assert verdict.startswith("The database cannot be used")
+    assert "Connection refused" in reason
+    assert "hunter2" not in done.stderr
+
+
 def test_other_packages_commands_stand_beside_ours(monkeypatch: pytest.MonkeyPatch) -> None:
     entry_point = EntryPoint("extra", "tests.test_cli:EXTRA", cli.GROUP)
     monkeypatch.setattr(cli.app, "registered_commands", list(cli.app.registered_commands))
@@ -126,6 +148,24 @@ def test_a_folder_without_a_calibration_says_why(tmp_path: Path) -> None:
     grey = camind(tmp_path, "calibrate", str(tmp_path / "photos"), "--out", str(tmp_path / "grey.json"))
     assert grey.returncode == 1
     assert "no result: the circles could be measured in none of the photographs" in grey.stdout
+
+
+@pytest.mark.parametrize(
+    ("name", "url", "code", "said"),
+    [
+        ("no name", "", 2, "'no name' is no name for a camera"),
+        ("bench", "postgresql+psycopg://u@127.0.0.1:1/x", 1, "The database cannot be used"),
+    ],
+)
+def test_a_camera_that_could_not_be_stored_is_said_before_calibrating(
+    tmp_path: Path, name: str, url: str, code: int, said: str
+) -> None:
+    cv2.imwrite(str(tmp_path / "grey.png"), np.full((300, 400, 3), 128, np.uint8))
+    asked = ("calibrate", str(tmp_path), "--out", str(tmp_path / "found.json"), "--register", name)
+    refused = camind(tmp_path, *asked, CAMIND_DATABASE_URL=url)
+    assert (refused.returncode, refused.stdout) == (code, "")
+    assert said in refused.stderr
+    assert not (tmp_path / "found.json").exists()
 
 
 BENCH = {
@@ -200,6 +240,20 @@ def test_a_folder_of_photographs_becomes_depth(bench: Path, tiny_model_dir: Path
     assert "has depth of 1 of 1 photographs, and had that of 1" in again.stdout
     assert (out / "half [b].npy").exists()
     assert (out / "whole.npy").stat().st_mtime_ns == kept
+
+
+def test_a_table_tells_photographs_of_any_name_apart(bench: Path, tiny_model_dir: Path) -> None:
+    photos = bench / "photos"
+    photos.mkdir()
+    names = (b"PXL_20240501_123456789.jpg", b"PXL_20240501_123457012.jpg", b"caf\xe9.jpg")
+    for name in names:
+        (photos / os.fsdecode(name)).write_bytes(b"\xff\xd8\xff")
+    asked = ["depth", str(photos), "--camera", "bench", "--out", str(bench / "depth"), "--model", str(tiny_model_dir)]
+    done = camind(bench, *asked, COLUMNS="80")
+    assert (done.returncode, "has depth of 0 of 3 photographs" in done.stdout) == (1, True), done.stderr
+    shown = "".join(line[:26].strip() for line in done.stdout.splitlines())
+    for name in names:
+        assert name.decode("utf-8", "replace") in shown
 
 
 @pytest.mark.parametrize(

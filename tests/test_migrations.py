@@ -17,6 +17,7 @@ from alembic.runtime.migration import MigrationContext
 from sqlalchemy import Engine, inspect, text
 
 import migrations
+from service.errors import NotReady
 from service.optics.camera import Camera
 from service.storage import schema
 from service.storage.cameras import CameraDraft, Cameras
@@ -98,6 +99,14 @@ def test_processes_that_migrate_at_once_wait_for_each_other(empty_engine: Engine
     with ThreadPoolExecutor(3) as pool:
         list(pool.map(lambda _: schema.upgrade(empty_engine), range(3)))
     assert schema.current_revision(empty_engine) == schema.head_revision()
+
+
+def test_the_schema_of_a_later_version_is_no_matter_of_migrating(engine: Engine) -> None:
+    with engine.begin() as connection:
+        connection.execute(text("UPDATE alembic_version SET version_num = '2099_01_01_later'"))
+    for step in (schema.upgrade, schema.require_head):
+        with pytest.raises(NotReady, match=r"at schema 2099_01_01_later, .* install the version that made it"):
+            step(engine)
 
 
 def test_foreign_keys_hold_again_after_migrating(engine: Engine) -> None:

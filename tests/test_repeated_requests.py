@@ -46,6 +46,12 @@ def calibrate(client: TestClient, key: str, content: bytes, camera: str = "bench
     return client.post(f"/calibrate?camera={camera}", files=files, headers={"Idempotency-Key": key})
 
 
+def forget(engine: Engine) -> None:
+    """Let a day go by."""
+    with engine.begin() as connection:
+        connection.execute(update(IdempotencyRow).values(created_at=datetime.now(UTC) - KEPT - timedelta(seconds=1)))
+
+
 def test_a_repeated_registration_answers_as_the_first(client: TestClient) -> None:
     first, again = register(client, "a"), register(client, "a")
     assert (first.status_code, again.status_code) == (201, 201)
@@ -98,6 +104,22 @@ def test_a_repeated_calibration_is_the_first(client: TestClient, settings: Setti
         assert other.status_code == 422
 
 
+def test_a_repeated_calibration_finds_no_queue_full(settings: Settings) -> None:
+    held = FakeCalibration(is_held=True)
+    app = create_app(settings.model_copy(update={"calibration_queue_size": 1}), held)
+    with TestClient(app) as client:
+        assert calibrate(client, "a", png(corners())).status_code == 202
+        assert held.has_begun.wait(15)
+        first = calibrate(client, "b", png(corners()))
+        assert first.status_code == 202
+        assert calibrate(client, "c", png(corners())).status_code == 503
+        again = calibrate(client, "b", png(corners()))
+        assert (again.status_code, again.headers["location"]) == (202, first.headers["location"])
+        assert calibrate(client, "b", png(corners()), "other").status_code == 422
+        forget(app.state.engine)
+        assert calibrate(client, "b", png(corners())).status_code == 503
+
+
 def test_a_restart_forgets_nothing(settings: Settings) -> None:
     with TestClient(create_app(settings)) as client:
         first = register(client, "a").json()
@@ -124,8 +146,7 @@ def test_owners_have_their_own_keys(engine: Engine) -> None:
 def test_a_key_is_forgotten_after_a_day(engine: Engine) -> None:
     cameras = Cameras(engine)
     cameras.add(DRAFT, ONCE)
-    with engine.begin() as connection:
-        connection.execute(update(IdempotencyRow).values(created_at=datetime.now(UTC) - KEPT - timedelta(seconds=1)))
+    forget(engine)
     with pytest.raises(Conflict):
         cameras.add(DRAFT, ONCE)
     cameras.add(replace(DRAFT, name="other"), replace(ONCE, fingerprint="1" * 64))

@@ -24,7 +24,7 @@ from service.storage.calibrations import CalibrationDraft, CalibrationRecord, Ca
 from service.storage.cameras import Cameras
 from service.storage.engine import open_engine
 from service.storage.spool import Spool, picture_file
-from tests.fake_calibration import RESULT, SETTINGS, FakeCalibration
+from tests.fake_calibration import RESULT, SETTINGS, FakeCalibration, without_calibrations
 from tests.inference.photographs import corners, jpeg, png
 
 PATIENCE_S = 15.0
@@ -295,3 +295,23 @@ def test_a_busy_database_costs_time_and_nothing_else(engine: Engine, spool: Spoo
     record = bench.ended(calibration_id)
     runner.close()
     assert (record.state, record.camera_revision) == ("succeeded", 1)
+
+
+def test_the_log_says_why_calibrations_wait_for_the_database(bench: Bench, engine: Engine) -> None:
+    fake = FakeCalibration(is_held=True)
+    calibration_id = bench.queue(png(corners()))
+    with structlog.testing.capture_logs() as events:
+
+        def until_told(name: str) -> None:
+            bench.until(lambda: any(event["event"] == name for event in events))
+
+        with without_calibrations(engine):
+            runner = bench.run(fake)
+            until_told("calibrations_wait")
+        runner.wake()
+        assert fake.has_begun.wait(PATIENCE_S)
+        with without_calibrations(engine):
+            fake.go.set()
+            until_told("calibration_waits_for_the_database")
+        assert bench.ended(calibration_id).state == "succeeded"
+    assert all("no such table: calibrations" in event["cause"] for event in events)

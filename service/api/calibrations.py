@@ -35,6 +35,7 @@ from service.errors import (
     InvalidImage,
     KeyReused,
     NotFound,
+    NotReady,
     TooLarge,
     UnsupportedKind,
 )
@@ -122,7 +123,7 @@ async def create_calibration(
     idempotency_key: IdempotencyKey = None,
 ) -> CalibrationRead:
     """Queue a calibration. It is worked on one at a time, survives a restart, and its photographs go when it ends."""
-    await _require_room(calibrations, spool, settings.calibration_queue_size)
+    await _require_room(calibrations, spool, settings.calibration_queue_size, idempotency_key)
     limits = FormLimits(settings.max_calibration_images, settings.max_image_bytes, settings.max_json_bytes)
     record = await _received(request, camera, limits, calibrations, spool, idempotency_key)
     runner.wake()
@@ -228,8 +229,10 @@ def cancel_calibration(
     runner.wake()
 
 
-async def _require_room(calibrations: Calibrations, spool: Spool, queue_size: int) -> None:
-    waiting = await run_in_threadpool(calibrations.waiting, spool.id)
+async def _require_room(calibrations: Calibrations, spool: Spool, queue_size: int, idempotency_key: str | None) -> None:
+    """What was done before will not wait once more, but its photographs arrive like others."""
+    is_repeated = idempotency_key is not None and await run_in_threadpool(calibrations.has_done, idempotency_key)
+    waiting = 0 if is_repeated else await run_in_threadpool(calibrations.waiting, spool.id)
     if waiting + spool.incoming >= queue_size:
         raise Busy(f"{queue_size} calibrations wait already: try again later.", retry_after_s=RETRY_AFTER_S)
 
@@ -280,7 +283,7 @@ async def _changes(
     yield record
     while not (record.has_ended or app.state.is_stopping):
         await asyncio.sleep(LOOK_S)
-        with suppress(Busy):
+        with suppress(Busy, NotReady):
             if await run_in_threadpool(calibrations.version, record.id) != record.version:
                 record = await run_in_threadpool(calibrations.get, record.id)
                 yield record

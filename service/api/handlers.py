@@ -29,9 +29,14 @@ async def answer_error(request: Request, exc: Exception) -> Response:
     error = _translated(request, exc)
     if isinstance(error, MethodNotAllowed) and request.method == "OPTIONS":
         return Response(status_code=204, headers=error.headers)
+    log_fault(error)
+    return problem_response(error)
+
+
+def log_fault(error: CamindError) -> None:
+    """Tell the log what is behind a fault of the service's own; a full queue is none."""
     if error.status >= 500 and not isinstance(error, Busy):
         log.error("unavailable", detail=error.detail, cause=repr(error.__cause__))
-    return problem_response(error)
 
 
 def _translated(request: Request, exc: Exception) -> CamindError:

@@ -21,7 +21,7 @@ from service.optics.camera import Camera
 from service.principal import LOCAL
 from service.storage.cameras import store_calibrated
 from service.storage.engine import reading, writing
-from service.storage.idempotency import Once, note, outcome_of
+from service.storage.idempotency import Once, note, noted, outcome_of
 from service.storage.tables import CalibrationRow
 
 State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
@@ -122,6 +122,11 @@ class Calibrations:
         except IntegrityError:
             # the same request, sent twice at once to two processes: the other one's is there now
             return self._add(draft, once)
+
+    def has_done(self, key: str) -> bool:
+        """Whether a request with this Idempotency-Key was done before."""
+        with reading(self._engine) as session:
+            return noted(session, self._owner or LOCAL, key) is not None
 
     def get(self, calibration_id: str) -> CalibrationRecord:
         """The calibration as it is now. Raises ``NotFound``."""

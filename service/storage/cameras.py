@@ -125,8 +125,7 @@ class Cameras:
 
     def store_calibrated(self, name: str, camera: Camera) -> CameraRecord:
         """Make the camera or give it a new revision, as a calibration found it. Raises ``BadRequest`` for no name."""
-        if not _is_name(name):
-            raise BadRequest(f"'{name[:80]}' is no name for a camera: letters, digits, '.', '_' and '-', 64 at most.")
+        require_name(name)
         with writing(self._engine) as session:
             return store_calibrated(session, self._owner, name, camera)
 
@@ -153,6 +152,12 @@ class Cameras:
             if once:
                 note(session, self._owner, once, str(record.revision))
             return record
+
+
+def require_name(name: str) -> None:
+    """Raise ``BadRequest`` for what is no name."""
+    if not _is_name(name):
+        raise BadRequest(f"'{name[:80]}' is no name for a camera: letters, digits, '.', '_' and '-', 64 at most.")
 
 
 def store_calibrated(session: Session, owner: str, name: str, camera: Camera) -> CameraRecord:

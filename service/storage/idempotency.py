@@ -35,10 +35,16 @@ def once_of(key: str | None, parts: Iterable[bytes]) -> Once | None:
     return Once(key, digest.hexdigest())
 
 
+def noted(session: Session, owner: str, key: str) -> IdempotencyRow | None:
+    """What is remembered of a key; None for a new one."""
+    row = session.get(IdempotencyRow, (owner, key))
+    return None if row is None or row.created_at < datetime.now(UTC) - KEPT else row
+
+
 def outcome_of(session: Session, owner: str, once: Once) -> str | None:
     """What came of the request before; None for a new one. Raises ``KeyReused`` where it was another request."""
-    row = session.get(IdempotencyRow, (owner, once.key))
-    if row is None or row.created_at < datetime.now(UTC) - KEPT:
+    row = noted(session, owner, once.key)
+    if row is None:
         return None
     if row.fingerprint != once.fingerprint:
         raise KeyReused("This Idempotency-Key came with another request before: send a new key with a new request.")

@@ -41,11 +41,16 @@ def require_head(engine: Engine) -> None:
     """Raise ``NotReady`` where the database is not at the newest migration."""
     current, head = current_revision(engine), head_revision()
     if current != head:
+        _require_known(current)
         raise NotReady(f"The database is at schema {current}, not at {head}: run `camind migrate`.")
 
 
 def upgrade(engine: Engine, revision: str = HEAD) -> None:
-    """Bring the database forward: all steps or none, and never two processes at once."""
+    """Bring the database forward: all steps or none, and never two processes at once.
+
+    Raises ``NotReady`` where a later version has migrated it.
+    """
+    _require_known(current_revision(engine))
     with _migrating(engine) as connection:
         command.upgrade(_config(connection), revision)
 
@@ -54,6 +59,14 @@ def downgrade(engine: Engine, revision: str = BASE) -> None:
     """Take the database back; what the later schema alone could hold is lost."""
     with _migrating(engine) as connection:
         command.downgrade(_config(connection), revision)
+
+
+def _require_known(revision: str | None) -> None:
+    if revision is not None and revision not in known_revisions():
+        raise NotReady(
+            f"The database is at schema {revision}, which this version does not know: "
+            "install the version that made it, or restore a backup."
+        )
 
 
 def _config(connection: Connection | None = None) -> Config:

@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from starlette.testclient import TestClient
 
 from service.app import create_app
 from service.config import Settings
-from tests.fake_calibration import RESULT, SETTINGS, FakeCalibration
+from tests.fake_calibration import RESULT, SETTINGS, FakeCalibration, without_calibrations
 from tests.inference.photographs import corners, jpeg, png
 from tests.simulated_sheets import CAMERA, DEPTHS_M, GRID, shots
 
@@ -223,6 +224,32 @@ def test_the_events_of_one_that_has_ended_are_its_end(client: TestClient) -> Non
     path = f"/calibrations/{send(client, prefer='wait=10').json()['id']}"
     events = events_of(client.get(f"{path}/events"))
     assert [event for _, event in events] == [client.get(path).json()]
+
+
+def test_waiting_outlasts_a_database_that_fails(client: TestClient, app: FastAPI, fake: FakeCalibration) -> None:
+    fake.go.clear()
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(send, client, prefer="wait=3")
+        assert fake.has_begun.wait(PATIENCE_S)
+        with without_calibrations(app.state.engine):
+            answer = waiting.result()
+    assert answer.status_code == 202
+    fake.go.set()
+    assert ended(client, answer.headers["location"])["state"] == "succeeded"
+
+
+def test_events_outlast_a_database_that_fails(client: TestClient, app: FastAPI, fake: FakeCalibration) -> None:
+    fake.go.clear()
+    path = send(client).headers["location"]
+    assert fake.has_begun.wait(PATIENCE_S)
+    with ThreadPoolExecutor(1) as pool:
+        following = pool.submit(client.get, f"{path}/events")
+        time.sleep(0.5)
+        with without_calibrations(app.state.engine):
+            time.sleep(0.5)
+        fake.go.set()
+        events = events_of(following.result())
+    assert events[-1][1]["state"] == "succeeded"
 
 
 def test_a_waiting_one_can_be_cancelled(client: TestClient, fake: FakeCalibration, spool_dir: Path) -> None:

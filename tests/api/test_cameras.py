@@ -397,6 +397,14 @@ def test_a_revision_that_is_at_hand_is_not_sent_again(
     assert client.get("/cameras/nobody", headers={"If-None-Match": "*"}).status_code == 404
 
 
+def test_no_cache_keeps_a_camera(client: TestClient, phone: dict[str, Any]) -> None:
+    path = client.post("/cameras", json=phone).headers["location"]
+    for tag, status in (('"2"', 200), ('"1"', 304)):
+        answer = client.get(path, headers={"If-None-Match": tag})
+        assert answer.status_code == status
+        assert (answer.headers["cache-control"], answer.headers["vary"]) == ("no-store", "Authorization")
+
+
 def test_no_content_has_no_type(client: TestClient, phone: dict[str, Any]) -> None:
     client.post("/cameras", json=phone)
     answer = client.delete(f"/cameras/{phone['name']}")
