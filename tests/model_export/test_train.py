@@ -372,6 +372,10 @@ def test_teachers_see_whole_what_is_learned_of_worn_pictures() -> None:
     whole = replace(drawn, mirrors=((),))
     worn = replace(whole, contrast=torch.full((2,), 0.3))
     wise = make_pair("compact")
+    with torch.no_grad():
+        wise.modules().get_parameter("depth.head.bias")[
+            4
+        ] = -4.5  # so sure that plain inversion tells nothing of its own
     pair = copy.deepcopy(wise)
 
     def unlike(batch: Batch) -> float:
@@ -385,7 +389,7 @@ def test_teachers_see_whole_what_is_learned_of_worn_pictures() -> None:
         assert of_worn > 1e-3
         pair.modules().get_parameter("depth.head.bias")[4] += 0.5  # how sure it is, no more
         assert unlike(whole) > 0.1
-        assert unlike(worn) == of_worn
+        assert unlike(worn) == pytest.approx(of_worn, rel=1e-3)
 
 
 def test_the_side_is_learned_from_the_truth_alone_where_it_is_learned_from_that() -> None:
