@@ -61,8 +61,8 @@ def _table(report: Report) -> Table:
     table = Table(photographs(), "circles", "blur px", "distance m", "tilt deg", "", box=None, pad_edge=False)
     for picture in report.pictures:
         figures = ((picture.blur_px, ".2f"), (picture.distance_m, ".3f"), (picture.tilt_deg, ".0f"))
-        shown = ["" if value is None else format(value, form) for value, form in figures]
-        table.add_row(picture.name, str(picture.circles), *shown, "; ".join(picture.warnings))
+        numbers = ["" if value is None else format(value, form) for value, form in figures]
+        table.add_row(picture.name, str(picture.circles), *numbers, "; ".join(picture.warnings))
     return table
 
 

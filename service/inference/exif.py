@@ -4,12 +4,17 @@ import struct
 from dataclasses import dataclass, replace
 
 from service.errors import InvalidImage
-from service.inference.headers import TiffDirectory, exif_directories
+from service.inference.headers import (
+    EXIF_DIGITAL_ZOOM,
+    EXIF_F_NUMBER,
+    EXIF_FOCAL_LENGTH,
+    TiffDirectory,
+    exif_directories,
+)
 
 MAKE, MODEL = 271, 272
-F_NUMBER, FOCAL_LENGTH, SUBJECT_DISTANCE = 0x829D, 0x920A, 0x9206
+SUBJECT_DISTANCE, FOCAL_LENGTH_35MM, LENS_MODEL = 0x9206, 0xA405, 0xA434
 WIDTH, HEIGHT, PLANE_RESOLUTION, PLANE_UNIT = 0xA002, 0xA003, 0xA20E, 0xA210
-DIGITAL_ZOOM, FOCAL_LENGTH_35MM, LENS_MODEL = 0xA404, 0xA405, 0xA434
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 MOST_TEXT = 64
 INFINITY = 2**32 - 1  # all ones, in a distance
@@ -47,11 +52,11 @@ def _with_shot(body: Exif, shot: TiffDirectory) -> Exif:
     return replace(
         body,
         lens=_text(shot, LENS_MODEL),
-        focal_length_mm=_number(shot, FOCAL_LENGTH),
+        focal_length_mm=_number(shot, EXIF_FOCAL_LENGTH),
         focal_length_35mm=_number(shot, FOCAL_LENGTH_35MM),
-        f_number=_number(shot, F_NUMBER),
+        f_number=_number(shot, EXIF_F_NUMBER),
         subject_distance_m=_number(shot, SUBJECT_DISTANCE),
-        digital_zoom=_number(shot, DIGITAL_ZOOM),
+        digital_zoom=_number(shot, EXIF_DIGITAL_ZOOM),
         width_px=int(width) if width else None,
         height_px=int(height) if height else None,
         focal_plane_pitch_um=_pitch_um(shot),

@@ -2,9 +2,9 @@
 
 import { html } from "./vendor/preact.js";
 
-/** @param {number} value @param {number} [digits] of its decimals; a millimetre by default */
-export function metres(value, digits = 3) {
-	return `${value.toFixed(digits)} m`;
+/** To a millimetre. @param {number} value */
+export function metres(value) {
+	return `${value.toFixed(3)} m`;
 }
 
 /** @typedef {import("./maps.js").Reading} Reading */
