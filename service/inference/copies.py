@@ -19,6 +19,7 @@ from service.optics.camera import Camera
 
 # of gamma, and of the pixels: what is read too sharp of scenes whose gamma is known is no more
 CLEARLY_SHARPER, SHARPER_FRACTION = 0.7, 0.1
+MAY_BE_SHARPER_PX = 0.6  # nothing is read as sharper than 0.42 px (docs/training.md)
 SHARPEST = 0.05  # of the pixels, as sharp as whose gamma then is taken to be
 OCTAVES = np.float32(1 / np.log(2))
 
@@ -51,16 +52,18 @@ class Read:
             defocus = thin_lens.relative_defocus_from_blur(blur_px[rows], self.camera.gamma_px, self.camera.k_cam_px)
             p_near[rows] = doubted(p_near[rows], defocus)
 
-    def sharper_gamma_px(self) -> float | None:
+    def sharper_gamma_px(self, blur_px: NDArray[np.float32]) -> float | None:
         """gamma, in pixels of the photograph, as its sharpest parts have it; None where the camera's may be true.
 
+        ``blur_px`` is what all of the photograph shows, or some places of it, in pixels of the copy.
         No blur is below gamma (eq. 6): where much of a photograph is clearly sharper, what was told is not its gamma,
         but for instance that of a small copy, which is no softer by the pixel than the large picture it was made of.
         """
-        blur_px, to_px = self.maps["blur_px"], self.camera.image_width_px
         if fraction(blur_px < CLEARLY_SHARPER * self.camera.gamma_px) <= SHARPER_FRACTION:
             return None
-        return thin_lens.gamma_before_averaging(float(np.quantile(blur_px, SHARPEST)), self.area.width_px, to_px)
+        return thin_lens.gamma_before_averaging(
+            float(np.quantile(blur_px, SHARPEST)), self.area.width_px, self.camera.image_width_px
+        )
 
     def maps_from(self, inner: Part) -> RawMaps:
         """The maps, as views, from where an area within this one begins."""

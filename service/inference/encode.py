@@ -23,6 +23,8 @@ from service.opencv import cv2
 
 MILLIMETRE = 0.001
 LARGEST_MILLIMETRES = 65535
+UNDISTORTING = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-6)
+LENS_CELL_PX, MOST_OFF_PX = 8, 0.5
 PERCENTILES = (0, 5, 50, 95, 100)
 MEDIA_TYPES: dict[str, str] = {
     "png": "image/png",
@@ -127,6 +129,8 @@ def encode_ply(answer: DepthMap, rgb: NDArray[np.uint8]) -> Encoded:
         detail = "A point cloud needs the camera's focal length: register it with intrinsics or lens."
         raise BadRequest(detail, errors=(FieldProblem("format", detail),))
     v, u = np.nonzero(answer.valid)
+    is_met = _is_met(answer)[v // LENS_CELL_PX, u // LENS_CELL_PX]
+    v, u = v[is_met], u[is_met]
     z = answer.depth_m[v, u]
     points = np.empty(
         len(z), [(axis, "<f4") for axis in "xyz"] + [(colour, "u1") for colour in ("red", "green", "blue")]
@@ -134,7 +138,10 @@ def encode_ply(answer: DepthMap, rgb: NDArray[np.uint8]) -> Encoded:
     points["x"], points["y"] = _rays(answer, u, v) * z
     points["z"] = z
     points["red"], points["green"], points["blue"] = rgb[v, u].T
-    return Encoded(_ply_header(len(z)) + points.tobytes(), MEDIA_TYPES["ply"])
+    lost = (
+        f"{1 - is_met.mean():.1%} of the points are left out: by the camera's distortion no ray meets the sensor there"
+    )
+    return Encoded(_ply_header(len(z)) + points.tobytes(), MEDIA_TYPES["ply"], warnings=() if is_met.all() else (lost,))
 
 
 def encode_preview(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
@@ -185,7 +192,23 @@ def _rays(answer: DepthMap, u: NDArray[np.intp], v: NDArray[np.intp]) -> NDArray
     if not distortion.any() or len(u) == 0:
         return np.stack([(u - matrix[0, 2]) / matrix[0, 0], (v - matrix[1, 2]) / matrix[1, 1]])
     places = np.stack([u, v], 1).astype(np.float64)[:, None]
-    return np.asarray(cv2.undistortPoints(places, matrix, distortion), np.float64)[:, 0].T
+    return np.asarray(cv2.undistortPoints(places, matrix, distortion, criteria=UNDISTORTING), np.float64)[:, 0].T
+
+
+def _is_met(answer: DepthMap) -> NDArray[np.bool_]:
+    """Whether rays meet the sensor in cells of ``LENS_CELL_PX`` each way, by their corners.
+
+    Towards the corners of a wide picture a lens' polynomial may turn back: nothing is distorted to what lies beyond.
+    """
+    down, across = (np.arange(0, size + LENS_CELL_PX, LENS_CELL_PX) for size in answer.depth_m.shape)
+    distortion = _distortion(answer)
+    if not distortion.any():
+        return np.ones((len(down) - 1, len(across) - 1), np.bool_)
+    u, v = (places.ravel() for places in np.meshgrid(across, down))
+    ahead = np.column_stack([*_rays(answer, u, v), np.ones(len(u))])
+    back = cv2.projectPoints(ahead, np.zeros(3), np.zeros(3), camera_matrix(answer), distortion)[0][:, 0]
+    is_met = (np.hypot(*(back - np.stack([u, v], 1)).T) <= MOST_OFF_PX).reshape(len(down), len(across))
+    return is_met[:-1, :-1] & is_met[1:, :-1] & is_met[:-1, 1:] & is_met[1:, 1:]
 
 
 def spread_of(answer: DepthMap) -> Spread:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from service.inference.artifact import Interval, Manifest, ModelFolder
 from service.inference.cancellation import Cancellation
-from service.inference.copies import Read, blend
+from service.inference.copies import MAY_BE_SHARPER_PX, Read, blend
 from service.inference.depth_map import NO_ANSWER, DepthMap, Reading, all_layers, decide, fraction
 from service.inference.known import Clues, KnownDepth, around
 from service.inference.later import Later
@@ -39,6 +39,7 @@ COARSER = 0.5
 # by 1.5 % or more from the whole's answer, the farthest by 5 and 6 %; with 320 px of the first for all copies, one in
 # 9 and 4, 6 and 14 %
 SURROUNDINGS_PX = 320
+PLACES, PLACE_PX = 5, 160  # each way: of a photograph of which a part is read, and of a copy
 BLURRED_FRACTION = 0.02
 FEW_ANSWERS = 0.5
 SMALL_PX = 600_000
@@ -171,13 +172,28 @@ class Estimator:
         """What the copies show, and the request by a camera that can have taken what is sharp in them."""
         scale = self._base_scale(request.camera)
         read = self._read_copies(request, scale)
-        gamma_px = read.sharper_gamma_px()
+        gamma_px = read.sharper_gamma_px(self._blur_all_over(request, read))
         if gamma_px is None or _is_blank(request.rgb):
             return request, read
         camera, told_px = replace(request.camera, gamma_px=gamma_px), request.camera.gamma_px
         said = f"gamma_px taken as {gamma_px:.3g}, where {told_px:.3g} was told: the photograph is sharper than that"
         request = replace(request, camera=camera, warnings=(*request.warnings, said))
         return request, self._read_copies(request, scale)
+
+    def _blur_all_over(self, request: _Request, read: Read) -> NDArray[np.float32]:
+        """What the copy shows; where it is of a part, and the camera may be too soft, what places of the whole do."""
+        if request.part is None or read.camera.gamma_px <= MAY_BE_SHARPER_PX:
+            return read.maps["blur_px"]
+        height, width = request.rgb.shape[:2]
+        side = min(height, width, round(PLACE_PX / read.scales[0]))
+        size = (max(1, round(side * read.scales[0])),) * 2
+        copies = (
+            cv2.resize(Part(left, top, left + side, top + side).of(request.rgb), size, interpolation=cv2.INTER_AREA)
+            for top in np.linspace(0, height - side, PLACES, dtype=int)
+            for left in np.linspace(0, width - side, PLACES, dtype=int)
+        )
+        seen = [self._pair.see(np.asarray(copy, np.uint8), request.cancellation)["blur_px"] for copy in copies]
+        return np.concatenate(seen)
 
     def _reading(self, request: _Request, read: Read, clues: Clues | None) -> tuple[Reading, tuple[str, ...]]:
         """What the networks' maps, which are written over, and known depths say together, and what to know of those."""

@@ -30,9 +30,15 @@ def camera_of(photograph: Photograph, camera: Camera) -> tuple[Camera, tuple[str
     turned = camera.turned(*TURNS[photograph.orientation])
     fitting = next((one for one in (turned, camera) if one.is_same_frame(width_px, height_px)), None)
     if fitting is None:
+        is_turned = any(one.is_same_frame(height_px, width_px) for one in (turned, camera))
+        advice = (
+            "send the original, whose EXIF says how the camera was held, or register a camera of that size"
+            if is_turned
+            else "send the whole frame, not a crop"
+        )
         raise ImageSizeMismatch(
             f"The photograph has {width_px}x{height_px} pixels upright, the camera "
-            f"{camera.image_width_px}x{camera.image_height_px}: send the whole frame, not a crop."
+            f"{camera.image_width_px}x{camera.image_height_px}: {advice}."
         )
     resized = fitting.resampled(width_px, height_px)
     if resized is fitting:

@@ -29,6 +29,7 @@ JPEG_BARE = frozenset({0x01, 0xD8, *range(0xD0, 0xD8)})
 TIFF_WIDTH, TIFF_HEIGHT, TIFF_BITS, TIFF_ORIENTATION, TIFF_SAMPLE_FORMAT = 256, 257, 258, 274, 339
 TIFF_NEW_SUBFILE = 254
 TIFF_STORES = ((273, 279), (324, 325))
+TIFF_PLANAR = 284
 TIFF_PHOTOMETRIC, TIFF_SUB_DIRECTORIES, TIFF_DNG_VERSION = 262, 330, 50706
 # photometric interpretations of sensor values: a filter array, and the same after demosaicing
 TIFF_SENSOR = frozenset({32803, 34892})
@@ -230,9 +231,20 @@ def _tiff(data: bytes) -> Header:
         raise UnsupportedKind("A tiff of floating-point numbers is no photograph: send 8 or 16 bits, sRGB.")
     if not set(directory.values(TIFF_BITS)) <= {8, 16}:
         raise UnsupportedKind("A tiff must have 8 or 16 bits a channel.")
+    _require_usual(directory)
     _require_tiles(directory)
     at = directory.offset_of(TIFF_ORIENTATION)
     return Header("tiff", *directory.size, directory.orientation(), at, data, _has_more_pages(data, directory))
+
+
+def _require_usual(directory: "TiffDirectory") -> None:
+    """What the decoder takes for something else in 16 bits: colours one after the other, and white as 0."""
+    if 16 not in directory.values(TIFF_BITS):
+        return
+    if 2 in directory.values(TIFF_PLANAR) and len(directory.values(TIFF_BITS)) > 1:
+        raise UnsupportedKind("A tiff of 16 bits that stores one colour after the other is not read: interleave them.")
+    if 0 in directory.values(TIFF_PHOTOMETRIC):
+        raise UnsupportedKind("A tiff of 16 bits whose 0 is white is not read: store black as 0.")
 
 
 def _has_more_pages(data: bytes, first: "TiffDirectory") -> bool:

@@ -48,22 +48,28 @@ function photosOf(files, role) {
  */
 export function useLooks(photos, setPhotos, query) {
 	const next = photos.find(({ asked }) => asked !== query);
+	const asks = !photos.some(lacksKey);
 	useEffect(() => {
 		if (!next || !query) return undefined;
 		const stop = new AbortController();
 		const tell = (/** @type {any} */ look, /** @type {Problem | null} */ problem = null) =>
 			setPhotos((before) => before.map((one) => (one.id === next.id ? { ...one, look, problem, asked: query } : one)));
-		lookAt(next.file, query, stop.signal).then(tell, (error) => stop.signal.aborted || tell(null, problemOf(error)));
+		lookAt(next.file, query, asks, stop.signal).then(tell, (error) => stop.signal.aborted || tell(null, problemOf(error)));
 		return () => stop.abort();
 	}, [next?.id, query]);
 }
 
-/** @param {File} file @param {string} query @param {AbortSignal} signal @returns {Promise<any>} */
-async function lookAt(file, query, signal) {
+/** Whether nobody gave the key that it asked for: the others then do not ask. @param {Photo} photo */
+function lacksKey({ problem }) {
+	return problem?.status === 401;
+}
+
+/** @param {File} file @param {string} query @param {boolean} asks @param {AbortSignal} signal @returns {Promise<any>} */
+async function lookAt(file, query, asks, signal) {
 	for (;;) {
 		try {
 			const headers = { "Content-Type": mediaTypeOf(file) };
-			return await getJson(`calibrate/look?${query}`, { method: "POST", headers, body: file, signal });
+			return await getJson(`calibrate/look?${query}`, { method: "POST", headers, body: file, asks, signal });
 		} catch (error) {
 			if (!(error instanceof Problem && error.retryAfterS)) throw error;
 			const waitMs = error.retryAfterS * 1000;
@@ -105,7 +111,7 @@ export function Photographs({ photos, query, focus, onChange, announce }) {
 					isLooking=${photo.asked !== query}
 					hasPartner=${hasPartner(photo, photos)}
 					onRole=${(/** @type {Role} */ role) => onChange((before) => before.map((one) => (one.id === photo.id ? { ...one, role } : one)))}
-					onAgain=${() => onChange((before) => before.map((one) => (one.id === photo.id ? { ...one, asked: "" } : one)))}
+					onAgain=${() => onChange((before) => before.map((one) => (one.id === photo.id || lacksKey(one) ? { ...one, asked: "", problem: null } : one)))}
 					onRemove=${() => onChange((before) => before.filter(({ id }) => id !== photo.id))}
 				/>`,
 			)}

@@ -134,6 +134,23 @@ def test_points_leave_the_lens_distortion_out(answer: DepthMap) -> None:
         np.testing.assert_array_equal(stored["distortion"], distortion)
 
 
+def test_what_no_ray_is_distorted_to_is_no_point(answer: DepthMap) -> None:
+    # this lens' polynomial turns back at 1.05 of a focal length from the middle: 40 px of 50
+    folding = replace(
+        answer, camera=replace(CAMERA, intrinsics=Intrinsics(38.0, 38.0, -10.0, 14.5, (-0.3, 0, 0, 0, 0)))
+    )
+    told = encode_ply(folding, RGB)
+    head, _, body = told.body.partition(b"end_header\n")
+    points = np.frombuffer(body, np.dtype([(axis, "<f4") for axis in "xyz"] + [(colour, "u1") for colour in "rgb"]))
+    assert 200 < len(points) < np.count_nonzero(answer.valid)
+    assert f"element vertex {len(points)}\n".encode() in head
+    assert np.abs(points["x"] / points["z"]).max() < 1.1
+    left_out = 1 - len(points) / np.count_nonzero(answer.valid)
+    assert told.warnings == (
+        f"{left_out:.1%} of the points are left out: by the camera's distortion no ray meets the sensor there",
+    )
+
+
 def test_preview_is_near_red_far_blue_and_grey_without_an_answer(answer: DepthMap) -> None:
     answer.depth_m[:8, :8] = np.nan
     pixels = cv2.imdecode(np.frombuffer(encode_preview(answer, RGB).body, np.uint8), cv2.IMREAD_COLOR_RGB)

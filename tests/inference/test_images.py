@@ -171,6 +171,22 @@ def test_a_tiff_of_floating_point_numbers_is_refused() -> None:
         read_photograph(encoded(".tiff", np.ones((8, 8, 3), np.float32)))
 
 
+@pytest.mark.parametrize(
+    ("form", "said"),
+    [
+        ({"photometric": "rgb", "planarconfig": "separate"}, "one colour after the other"),
+        ({"photometric": "miniswhite"}, "0 is white"),
+    ],
+)
+def test_a_tiff_of_16_bits_that_the_decoder_takes_for_another_is_refused(form: dict[str, str], said: str) -> None:
+    colours = np.linspace(0, 65535, 24 * 32 * 3).astype(np.uint16).reshape(24, 32, 3)
+    pixels = np.moveaxis(colours, 2, 0) if "planarconfig" in form else colours[..., 0]
+    out = BytesIO()
+    tifffile.imwrite(out, pixels, metadata=None, **form)
+    with pytest.raises(UnsupportedKind, match=said):
+        read_photograph(out.getvalue())
+
+
 def test_bytes_and_pixels_are_limited_before_decoding() -> None:
     with pytest.raises(TooLarge, match="bytes"):
         read_photograph(png(corners()), limits=ImageLimits(max_bytes=50))

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, FilePayload, Page, expect
 
 from model_export.served import Server, serving
 from service.config import DATABASE_FILE
@@ -16,7 +17,8 @@ from service.principal import EVERYDAY, SCOPES, Scope
 from service.storage import schema
 from service.storage.engine import open_engine
 from service.storage.keys import Keys
-from tests.web.steps import OVERFLOW
+from tests.inference.photographs import png
+from tests.web.steps import OVERFLOW, to_photographs
 from tests.web.watched import watched
 
 ROOT = Path(__file__).parents[2]
@@ -169,6 +171,25 @@ def test_without_a_key_the_page_says_what_it_lacks(
         page.get_by_role("button", name="Try again").first.click()
         give_key(page, keyed.key())
         expect(page.get_by_role("alert").filter(visible=True)).to_have_count(0)
+
+
+def test_photographs_of_the_sheet_ask_once_for_a_key_that_nobody_gives(browser: Browser, keyed: Keyed) -> None:
+    with watched(browser, keyed.server.url, [REFUSED]) as page:
+        page.goto("")
+        dialog = page.get_by_role("dialog", name="API key")
+        expect(dialog).to_be_visible()
+        page.keyboard.press("Escape")
+        to_photographs(page, "bench")
+        grey = png(np.full((480, 640, 3), 120, np.uint8))
+        of_nothing = [FilePayload(name=f"{place}.png", mimeType="image/png", buffer=grey) for place in range(3)]
+        page.locator("input[data-role=defocused]").set_input_files(of_nothing)
+        expect(dialog).to_be_visible()
+        page.keyboard.press("Escape")
+        expect(page.get_by_text("not looked at")).to_have_count(3)
+        expect(dialog).to_be_hidden()
+        page.get_by_role("button", name="Look again").last.click()
+        give_key(page, keyed.key())
+        expect(page.get_by_text("no grid", exact=True)).to_have_count(3)
 
 
 @pytest.mark.parametrize(("scopes", "seen"), [(EVERYDAY, "scope admin"), (SCOPES, "waiting")])
