@@ -41,6 +41,7 @@ CELL_CONTRAST = 0.03
 TEXTURED_SHARE = 0.6
 SIDES: dict[int, Side] = {-1: "near", 0: "auto", 1: "far"}
 FIXED = "fixed"
+SETS = ("rgbd", "tabletop", "d200", "blender")  # a folder of data each
 FIXED_SCENES = 6
 ORACLE_FACTORS = (0.8, 0.9, 1.0, 1.1, 1.25, 1.4)
 MISFOCUSED = ("focus -10%", "focus +10%")
@@ -227,6 +228,8 @@ def blender_cases(folder: Path, count: int) -> Iterator[Case]:
     cameras = json.loads((folder / "cameras.json").read_text())
     for photo in _spread(folder, count):
         height, width = photo.image.shape[:2]
+        if photo.name not in cameras:
+            raise ValueError(f"{folder / 'cameras.json'} has no {photo.name}, which {folder / 'color'} has")
         told = cameras[photo.name]
         inner = Intrinsics.centred(told["fx_px"], width, height)
         camera = Camera(width, height, told["focus_distance_m"], told["k_cam_px"], told["gamma_px"], intrinsics=inner)
@@ -266,9 +269,10 @@ def _enough(source: CaseSource) -> Iterator[Case]:
 
 
 def trials(data: Path, quick: bool) -> list[Trial]:
-    """The sets that the data folder can serve; a missing folder is a missing set."""
+    """The sets that the data folder can serve; a folder that is missing, or has no pictures, is a missing set."""
     few, _, many, scenes = COUNTS[quick]
-    indoor = [data / name for name in ("rgbd", "tabletop") if (data / name).is_dir()]
+    there = {name: data / name for name in SETS if any((data / name / "color").glob("*"))}
+    indoor = [there[name] for name in ("rgbd", "tabletop") if name in there]
     found = []
     if len(indoor) == 2:
         found += [_trial(f"plane {depth_m:g} m", partial(plane_cases, data, depth_m, few)) for depth_m in PLANES_M]
@@ -276,12 +280,12 @@ def trials(data: Path, quick: bool) -> list[Trial]:
     found += [
         _trial(f"procedural {n}", partial(procedural_cases, scenes, side)) for n, side in PROCEDURAL_SIDES.items()
     ]
-    if (data / "blender" / "cameras.json").is_file():
-        found.append(_trial("blender", partial(blender_cases, data / "blender", 2 * scenes), "right side"))
+    if "blender" in there:
+        found.append(_trial("blender", partial(blender_cases, there["blender"], 2 * scenes), "right side"))
     for folder in indoor:
         found += _indoor_trials(folder, quick)
-    if (data / "d200").is_dir():
-        source = partial(d200_cases, data / "d200", 2 * many)
+    if "d200" in there:
+        source = partial(d200_cases, there["d200"], 2 * many)
         told = ("ring from the sensor", "registered large", *MISFOCUSED)
         further = ("right side", *told, "gt" + KNOWN_DEPTHS, MISFOCUSED[1] + KNOWN_DEPTHS)
         found.append(replace(_trial("d200", source, *further), factors=ORACLE_FACTORS))

@@ -1,19 +1,22 @@
 """What training adds to the command ``camind``: train, average, export, verify, evaluate, bench, blender."""
 
 import json
+import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 from rich.table import Column, Table
 
-from model_export.config import Kind, Part, TrainConfig
+from model_export.config import MOST_SEED, Kind, Part
 from model_export.progress import progress_bar
 from service.config import INT8
+from service.inference.artifact import load_model_folder
 
 if TYPE_CHECKING:  # importing torch takes seconds; a command that needs it does so itself
     from model_export.verify import Difference
@@ -31,6 +34,8 @@ Teachers = Annotated[
     list[Path] | None,
     typer.Option(help="checkpoint or model folder to learn the answers of, too; of several their mean", exists=True),
 ]
+Seed = Annotated[int | None, typer.Option(min=0, max=MOST_SEED, help="the same seed is the same run", show_default="1")]
+Rate = Annotated[float | None, typer.Option(min=1e-6, max=1e-2, help="before it falls", show_default="0.001")]
 Threads = Annotated[
     int | None,
     typer.Option(
@@ -69,14 +74,25 @@ def _training_parts() -> Iterator[None]:
         raise _fail(f"{exc.name} is not installed: pip install 'camind[train]' brings it") from exc
 
 
+@contextmanager
+def _plain_failures() -> Iterator[None]:
+    """Around what reads and writes folders: what is wrong with them is said in a line."""
+    try:
+        yield
+    except (OSError, ValueError) as exc:
+        raise _fail(str(exc)) from exc
+
+
 @commands.command()
 def train(
-    run: Annotated[Path, typer.Option(help="folder of the run: its checkpoint lies there and is gone on from")],
+    run: Annotated[
+        Path, typer.Option(help="folder of the run: its checkpoint lies there and is gone on from", file_okay=False)
+    ],
     textures: Textures,
     frames: Frames = None,
-    kind: Annotated[Kind, typer.Option(help="ours or the paper's pair")] = "compact",
-    steps: Annotated[int, typer.Option(min=1, help="batches in the whole run")] = 12_000,
-    seed: Annotated[int, typer.Option(min=0, help="the same seed is the same run")] = 1,
+    kind: Annotated[Kind | None, typer.Option(help="ours or the paper's pair", show_default="compact")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="batches in the whole run", show_default="12000")] = None,
+    seed: Seed = None,
     weights: Annotated[
         Path | None, typer.Option(help="checkpoint or model folder whose weights a new run begins with", exists=True)
     ] = None,
@@ -84,7 +100,7 @@ def train(
         bool, typer.Option("--fresh-decoders", help="of --weights the encoders alone: decoders and heads begin anew")
     ] = False,
     teacher: Teachers = None,
-    learning_rate: Annotated[float, typer.Option(min=1e-6, max=1e-2, help="before it falls")] = 1e-3,
+    learning_rate: Rate = None,
     setting: Annotated[
         list[str] | None,
         typer.Option(help="anything else of the run: decay_share=0.8, scenes.frame_share=0.5, scenes.k_cam_px=[1,20]"),
@@ -93,14 +109,19 @@ def train(
     threads: Threads = None,
     device: Annotated[str, typer.Option(help="torch device")] = "cpu",
 ) -> None:
-    """Train a pair of networks on procedural scenes; stop and start it as you like."""
+    """Train a pair of networks on procedural scenes; stop (Ctrl-C) and start it as you like.
+
+    A run that is gone on with has what it was begun with, but for what is given anew, which is said.
+    """
     with _training_parts():
+        from model_export.train import config_of
         from model_export.train import train as run_training
 
-    plain = TrainConfig(kind=kind, seed=seed, steps=steps, learning_rate=learning_rate)
-    try:
+    told = {"kind": kind, "steps": steps, "seed": seed, "learning_rate": learning_rate}
+    given = [f"{name}={json.dumps(value)}" for name, value in told.items() if value is not None]
+    with _plain_failures():
         path = run_training(
-            plain.adjusted(setting or ()),
+            config_of(run, [*given, *(setting or ())]),
             textures,
             run,
             frames=frames,
@@ -111,8 +132,6 @@ def train(
             threads=threads,
             device=device,
         )
-    except (FileNotFoundError, ValueError) as exc:
-        raise _fail(str(exc)) from exc
     typer.echo(path)
 
 
@@ -136,10 +155,8 @@ def narrow(
         from model_export.narrowed import narrow as run_narrowing
         from model_export.networks import Widths
 
-    try:
+    with _plain_failures():
         change = run_narrowing(model, textures, Widths(_channels(blur), _channels(depth)), out)
-    except (FileNotFoundError, ValueError) as exc:
-        raise _fail(str(exc)) from exc
     typer.echo(f"{out}: on other scenes blur is {change.blur:.1%} and depth {change.depth:.1%} off that of {model}")
 
 
@@ -157,18 +174,15 @@ def average(
     with _training_parts():
         from model_export.train import Checkpoint
 
-    try:
-        mean = Checkpoint.load(first).averaged(Checkpoint.load(second), share, part or "")
-    except ValueError as exc:
-        raise _fail(str(exc)) from exc
-    mean.save(out)
+    with _plain_failures():
+        Checkpoint.load(first).averaged(Checkpoint.load(second), share, part or "").save(out)
     typer.echo(out)
 
 
 @commands.command()
 def export(
     checkpoint: Checkpoint,
-    out: Annotated[Path, typer.Option(help="model folder to write")],
+    out: Annotated[Path, typer.Option(help="model folder to write", file_okay=False)],
     textures: Annotated[
         Path | None,
         typer.Option(help="pictures that a run was trained with, with LICENCES.md", exists=True, file_okay=False),
@@ -190,22 +204,24 @@ def export(
         from model_export.quantized import quantised_graphs
 
     pictures = [folder for folder in (textures, frames) if folder is not None]
-    with progress_bar(Console(stderr=True)) as progress:
+    # what breaks off leaves no folder that serves, without its corrections
+    with TemporaryDirectory() as scratch, progress_bar(Console(stderr=True)) as progress, _plain_failures():
+        built = Path(scratch)
         task = progress.add_task("float32", total=5)
-        try:
-            manifest = export_checkpoint(checkpoint, pictures, out, name)
-        except ValueError as exc:
-            raise _fail(str(exc)) from exc
+        manifest = export_checkpoint(checkpoint, pictures, built, name)
         progress.update(task, advance=1, description=INT8)
-        in_int8 = partial(quantised_graphs, floating=out)
-        export_checkpoint(checkpoint, pictures, out / INT8, f"{manifest.name}-{INT8}", in_int8)
+        in_int8 = partial(quantised_graphs, floating=built)
+        export_checkpoint(checkpoint, pictures, built / INT8, f"{manifest.name}-{INT8}", in_int8)
         progress.update(task, advance=1, description="held-out scenes")
         cases = unseen_cases()
         progress.advance(task)
-        for folder in (out, out / INT8):
-            gain, temperature = calibrate(folder, cases)
+        found = {}
+        for folder in (Path(), Path(INT8)):
+            found[out / folder] = calibrate(built / folder, cases)
             progress.advance(task)
-            typer.echo(f"{folder}: blur times {gain:.3f}, stated errors times {temperature:.2f}")
+        shutil.copytree(built, out, dirs_exist_ok=True)
+    for folder, (gain, temperature) in found.items():
+        typer.echo(f"{folder}: blur times {gain:.3f}, stated errors times {temperature:.2f}")
 
 
 @commands.command()
@@ -214,10 +230,8 @@ def verify(checkpoint: Checkpoint, model: Model = DEFAULT_MODEL) -> None:
     with _training_parts():
         from model_export.verify import TOLERANCE, verify_checkpoint
 
-    try:
+    with _plain_failures():
         differences = verify_checkpoint(checkpoint, model)
-    except ValueError as exc:
-        raise _fail(str(exc)) from exc
     Console().print(_differences(differences))
     worst = max(d.relative for d in differences)
     if not worst <= TOLERANCE:
@@ -243,7 +257,7 @@ def evaluate(
     quick: Annotated[bool, typer.Option(help="a few pictures of each set")] = False,
     out: Annotated[
         Path | None,
-        typer.Option(help="folder for report.html, report.json and their pictures; beside/ has the other's"),
+        typer.Option(help="folder for report.html, report.json and pictures; beside/ has the other's", file_okay=False),
     ] = None,
     update_card: Annotated[bool, typer.Option(help="write the scores into cards and manifests")] = False,
 ) -> None:
@@ -251,12 +265,19 @@ def evaluate(
     with _training_parts():
         from model_export import report as reports
         from model_export.card import record_scores
-        from model_export.cases import trials
+        from model_export.cases import SETS, trials
         from model_export.evaluate import evaluate as run_evaluation
 
-    sets = trials(data, quick)
     models = [model] if beside is None else [model, beside]
-    with progress_bar(Console(stderr=True)) as progress:
+    with _plain_failures():
+        for folder in models:
+            load_model_folder(folder)
+        if out is not None:
+            out.mkdir(parents=True, exist_ok=True)
+    sets = trials(data, quick)
+    if missing := [name for name in SETS if not any(trial.name.startswith(name) for trial in sets)]:
+        typer.secho(f"{data} has no pictures of {', '.join(missing)}: without them", err=True)
+    with progress_bar(Console(stderr=True)) as progress, _plain_failures():
         task = progress.add_task("loading", total=len(sets))
         found = run_evaluation(
             models, sets, lambda said, finished: progress.update(task, description=said, advance=finished)
@@ -296,6 +317,8 @@ def speed(
     with _training_parts():
         from model_export import bench_speed
 
+    with _plain_failures():
+        load_model_folder(model)
     with progress_bar(Console(stderr=True)) as progress:
         task = progress.add_task("measuring", total=bench_speed.steps(rounds))
         report = bench_speed.measure(model, rounds, seconds, lambda: progress.advance(task))

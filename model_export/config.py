@@ -3,12 +3,13 @@
 import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
 LARGER = 2  # times as wide and as high
 LARGE_SEED = 2**16  # larger pictures' seed is so much above
+MOST_SEED = 255  # the scenes that models are scored on have those above
 
 Kind = Literal["compact", "paper"]
 Learning = Literal["all", "depth", "layout"]
@@ -73,9 +74,9 @@ class TrainConfig:
     """
 
     kind: Kind = "compact"
-    seed: int = 1
-    steps: int = 12_000
-    batch: int = 8
+    seed: Annotated[int, Field(ge=0, le=MOST_SEED)] = 1
+    steps: Annotated[int, Field(ge=1)] = 12_000
+    batch: Annotated[int, Field(ge=1)] = 8
     learning_rate: float = 1e-3
     weight_decay: float = 1e-4
     warmup_steps: int = 200
@@ -88,7 +89,7 @@ class TrainConfig:
     teacher_shares: tuple[tuple[float, float], ...] = ()
     learning: Learning = "all"
     likeness_weight: float = 10.0
-    pool: int = 600
+    pool: Annotated[int, Field(ge=1)] = 600
     fresh_per_step: float = 1.0
     retaken: bool = False
     turned_share: float = 0.3
@@ -96,7 +97,7 @@ class TrainConfig:
     large_share: float = 0.0
     faded_share: float = 0.0
     dimmed_share: float = 0.0
-    checkpoint_every: int = 250
+    checkpoint_every: Annotated[int, Field(ge=1)] = 250
     settled_share: float = 0.35
     settle_batches: int = 60
     scenes: SceneConfig = MIXTURE
@@ -129,7 +130,7 @@ class TrainConfig:
     def adjusted(self, settings: Iterable[str]) -> "TrainConfig":
         """This one with values given as ``name=JSON``, those of the scenes as ``scenes.name=JSON``.
 
-        Raises ``ValueError`` for a name that it does not have, or a value of another kind.
+        Raises ``ValueError`` for a name that it does not have, or a value of another kind or out of bounds.
         """
         values = self.as_dict()
         for setting in settings:
@@ -143,7 +144,16 @@ class TrainConfig:
             except json.JSONDecodeError as exc:
                 raise ValueError(f"{setting}: {value} is neither a number nor other JSON") from exc
         try:
-            return TypeAdapter(TrainConfig).validate_python(values)
+            told = TypeAdapter(TrainConfig).validate_python(values)
         except ValidationError as exc:
             wrong = exc.errors(include_url=False)[0]
             raise ValueError(f"{'.'.join(map(str, wrong['loc']))}: {wrong['msg']}") from exc
+        for name, span in asdict(told.scenes).items():
+            if isinstance(span, tuple) and span[0] > span[1]:
+                raise ValueError(f"scenes.{name}: the first of {list(span)} is to be the lower one")
+        return told
+
+    def unlike(self, other: "TrainConfig") -> list[str]:
+        """What is set otherwise than in another, as ``name value for value``."""
+        ours, theirs = ({**own, **own.pop("scenes")} for own in (self.as_dict(), other.as_dict()))
+        return [f"{name} {value} for {theirs[name]}" for name, value in ours.items() if value != theirs[name]]

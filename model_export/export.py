@@ -271,11 +271,18 @@ def export_checkpoint(
     """Write the model folder of a checkpoint file; the card carries the licences of the folders it was trained with.
 
     Of a float32 model folder what today's code makes of its weights; of what they were trained with its card tells.
+    Raises ``FileNotFoundError`` for a folder of pictures that states no licences.
     """
     loaded = Checkpoint.load(checkpoint)
     if checkpoint.is_dir():
         sources = sources_of(load_model_folder(checkpoint).card())
     else:
-        licences = (trained_with / LICENCES for trained_with in pictures)
-        sources = "".join(file.read_text() for file in licences if file.exists())
+        sources = "".join(_licences_of(trained_with) for trained_with in pictures)
     return export_pair(loaded.pair(), loaded.config, loaded.step, folder, name, sources, write_graphs)
+
+
+def _licences_of(pictures: Path) -> str:
+    file = pictures / LICENCES
+    if not file.is_file():
+        raise FileNotFoundError(f"{pictures} has no {LICENCES}, which the model card states: write one")
+    return file.read_text()

@@ -40,9 +40,11 @@ class Frame:
 def load_frames(folder: Path) -> list[Frame]:
     """All frames of a folder with ``color/``, ``depth/`` and ``cameras.json``. Raises if there is none."""
     cameras = json.loads((folder / "cameras.json").read_text())
+    photos = list(load_photos(folder))
+    if unknown := [photo.name for photo in photos if photo.name not in cameras]:
+        raise ValueError(f"{folder / 'cameras.json'} has no {unknown[0]}, which {folder / 'color'} has")
     return [
-        Frame(photo.image, filled(photo.depth_m).astype(np.float16), cameras[photo.name]["fx_px"])
-        for photo in load_photos(folder)
+        Frame(photo.image, filled(photo.depth_m).astype(np.float16), cameras[photo.name]["fx_px"]) for photo in photos
     ]
 
 

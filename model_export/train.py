@@ -6,6 +6,8 @@ is one run, however fast the scene workers are and however often it is stopped.
 
 import math
 import os
+import pickle
+import signal
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -14,7 +16,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from queue import Queue
-from threading import Thread
+from threading import Event, Thread, current_thread, main_thread
 from typing import Any
 
 import cv2
@@ -25,7 +27,7 @@ from torch import Tensor, nn
 from torch.nn.utils import convert_conv2d_weight_memory_format
 from torch.utils.data import DataLoader, Dataset
 
-from model_export.config import Kind, Learning, SceneConfig, TrainConfig
+from model_export.config import MOST_SEED, Kind, Learning, SceneConfig, TrainConfig
 from model_export.cores import computes_bfloat16, sent, torch_threads
 from model_export.darkroom import photograph
 from model_export.folded import folded
@@ -45,7 +47,8 @@ LEAST_CONTRAST = 0.15  # of a faded picture, as a part of what it had
 LEAST_LIGHT = 0.2  # of a dimmed one
 # a camera known by its specs has a guess for gamma: mostly too low a one, since motion, haze and filters add softness
 GUESSED_GAMMA_SHARE, GUESSED_GAMMA = 0.6, (-0.2, 0.35)  # mean and standard deviation of the guess's log error
-HELD_OUT_SEED = 2**40
+HELD_OUT_SEED = (MOST_SEED + 1) * 2**32
+CHECKPOINT = "checkpoint.pt"
 UNCHANGED = TrainConfig()
 AHEAD = 64
 MOST_HELD_OUT = 32
@@ -74,6 +77,7 @@ def _worker_start(_: int) -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     os.nice(19)  # steps come first where cores are shared
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever stops a run stops its steps, which then save what they did
 
 
 def scene_stream(config: TrainConfig, material: Material, start: int, end: int, workers: int) -> Iterator[Drawn]:
@@ -268,19 +272,24 @@ class Checkpoint:
             "modules": self.modules,
             "optimizers": self.optimizers,
         }
+        path.parent.mkdir(parents=True, exist_ok=True)
         scratch = path.with_suffix(".part")
         torch.save(content, scratch)
         scratch.replace(path)
 
     @classmethod
     def load(cls, path: Path) -> "Checkpoint":
-        """Of a file, or of a float32 model folder; raises ``ValueError`` for one of another version."""
-        content = _as_checkpoint(path) if path.is_dir() else torch.load(path, map_location="cpu", weights_only=True)
+        """Of a file, or of a float32 model folder; ``ValueError`` for one of another version, or that is none."""
         try:
-            config = TrainConfig.from_dict(content["config"])
+            content = _as_checkpoint(path) if path.is_dir() else torch.load(path, map_location="cpu", weights_only=True)
+            told, step, modules = (content[name] for name in ("config", "step", "modules"))
+        except (RuntimeError, EOFError, pickle.UnpicklingError, LookupError, TypeError) as exc:
+            raise ValueError(f"{path} is no checkpoint of camind, or is cut off or damaged") from exc
+        try:
+            config = TrainConfig.from_dict(told)
         except TypeError as exc:
             raise ValueError(f"{path} was written by another version of camind: {exc}") from exc
-        return cls(config, content["step"], content["modules"], content.get("optimizers", []))
+        return cls(config, step, modules, content.get("optimizers", []))
 
     def averaged(self, other: "Checkpoint", share: float = 0.5, part: str = "") -> "Checkpoint":
         """This one with its weights moved by ``share`` towards another run's, one of them trained on from the other.
@@ -289,10 +298,12 @@ class Checkpoint:
 
         Of two such runs the mean is often better than either (Izmailov et al. 2018). A share below 0 goes on past this
         one, away from the other, as a longer run might have; a batch norm's variance no further than to 0. Raises
-        ``ValueError`` for networks of another kind.
+        ``ValueError`` for networks of another kind or width.
         """
         if other.config.kind != self.config.kind:
             raise ValueError(f"weights of a {self.config.kind} and a {other.config.kind} pair have no mean")
+        if Widths.of(other.modules) != Widths.of(self.modules):
+            raise ValueError("weights of pairs with other channels have no mean")
         modules = self.modules | {
             name: torch.lerp(own, other.modules[name], share)
             for name, own in self.modules.items()
@@ -506,6 +517,35 @@ class Trainer:
         return Checkpoint(self.config, self.step, self.modules.state_dict(), self.optimizers.state_dict())
 
 
+def config_of(run: Path, settings: Iterable[str]) -> TrainConfig:
+    """That of a run's checkpoint, or of a new run's, but for what is set now, as ``TrainConfig.adjusted`` has it.
+
+    Raises ``ValueError`` for a checkpoint that cannot be read, or a setting that is none.
+    """
+    path = run / CHECKPOINT
+    return (Checkpoint.load(path).config if path.exists() else UNCHANGED).adjusted(settings)
+
+
+@contextmanager
+def _interruptible() -> Iterator[Event]:
+    """An event that says that the run was asked to stop (Ctrl-C), which it does after a step; asked again, at once."""
+    asked = Event()
+    if current_thread() is not main_thread():
+        yield asked
+        return
+
+    def ask(*_: object) -> None:
+        if asked.is_set():
+            raise KeyboardInterrupt
+        asked.set()
+
+    before = signal.signal(signal.SIGINT, ask)
+    try:
+        yield asked
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 class Pace:
     """How fast steps go, and what part of the time they wait for scenes: a starved run says so."""
 
@@ -545,13 +585,15 @@ def train(
     ``fresh_decoders`` only with those of the encoders. ``teachers``, checkpoints or folders too, are those whose
     answers, on average, are learned beside the truth. Torch computes on so many ``threads``, by itself on the cores
     that ``workers`` leave; other threads are another run by rounding.
-    Raises ``ValueError`` for weights of another kind, and for a run with teachers that is gone on with without.
+    Raises ``ValueError`` for weights of another kind, for a run with teachers that is gone on with without, and for a
+    device that is not there. Where it is interrupted, the run saves what it did and raises ``KeyboardInterrupt``.
     """
     console = console or Console(stderr=True)
+    _require_device(device)
     material = Material(load_photographs(textures), [] if frames is None else load_frames(frames))
     run.mkdir(parents=True, exist_ok=True)
-    path = run / "checkpoint.pt"
-    trainer, start = _opened(config, path, weights, teachers, device, fresh_decoders=fresh_decoders)
+    path = run / CHECKPOINT
+    trainer, start = _opened(config, path, weights, teachers, device, console, fresh_decoders=fresh_decoders)
     config = trainer.config
     pools = Pools(config, material, trainer.step, workers, device)
     test = held_out(config.scenes, material, min(2 * config.batch, MOST_HELD_OUT)).changed(trainer.moved)
@@ -561,17 +603,37 @@ def train(
             pass
         if start is not None and weights is not None:
             if weights.is_dir():
-                start.modules().to(trainer.device)
-                spread_norms(
-                    start, (partial(run_pair, start, batch.changed(trainer.moved)) for batch in pools.settling())
-                )
+                _spread(start, trainer, pools)
             trainer.begin_with(with_fresh_decoders(start) if fresh_decoders else start)
         task = progress.add_task("training", total=config.steps, completed=trainer.step)
-        for said in _steps(trainer, pools, test, path):
-            progress.update(task, completed=trainer.step)
-            if said is not None:
-                console.print(said)
+        with _interruptible() as asked:
+            for said in _steps(trainer, pools, test, path):
+                progress.update(task, completed=trainer.step)
+                if said is not None:
+                    console.print(said)
+                if asked.is_set() and trainer.step < config.steps:
+                    raise _stopped(trainer, path, console)
     return path
+
+
+def _stopped(trainer: Trainer, path: Path, console: Console) -> KeyboardInterrupt:
+    trainer.checkpoint().save(path)
+    console.print(f"stopped after step {trainer.step} of {trainer.config.steps}, which is saved")
+    return KeyboardInterrupt()
+
+
+def _spread(start: Pair, trainer: Trainer, pools: Pools) -> None:
+    """Give a model folder's networks, whose batch norms are folded away, such as the run's scenes ask for."""
+    start.modules().to(trainer.device)
+    spread_norms(start, (partial(run_pair, start, batch.changed(trainer.moved)) for batch in pools.settling()))
+
+
+def _require_device(name: str) -> None:
+    """Raises ``ValueError`` for what torch cannot compute on here."""
+    try:
+        torch.zeros(1, device=name)
+    except (RuntimeError, AssertionError) as exc:
+        raise ValueError(f"torch does not compute on {name} here: {str(exc).splitlines()[0]}") from exc
 
 
 def _steps(trainer: Trainer, pools: Pools, test: Batch, path: Path) -> Iterator[str | None]:
@@ -598,22 +660,29 @@ def _opened(
     weights: Path | None,
     teachers: Sequence[Path],
     device: str,
+    console: Console,
     *,
     fresh_decoders: bool,
 ) -> tuple[Trainer, Pair | None]:
     """The trainer of a run, as its checkpoint left it if there is one, and the networks that a new run begins with.
 
-    With such networks the norms' statistics stay as they are, but where decoders begin anew, or the layout's part is
-    learned apart: a batch's own would undo much of what was learned.
+    What is set otherwise in a run that is gone on with is said. With such networks the norms' statistics stay as they
+    are, but where decoders begin anew, or the layout's part is learned apart: a batch's own would undo much of what
+    was learned.
     """
     resume = Checkpoint.load(path) if path.exists() else None
     if resume is not None and resume.config.taught != bool(teachers):
         how = "with" if resume.config.taught else "without"
         raise ValueError(f"{path.parent} was begun {how} a --teacher: go on {how} one")
     config = replace(config, taught=bool(teachers))
+    if resume is not None:
+        _require_onward(config, resume, path.parent)
+        config = replace(config, settled_share=resume.config.settled_share)
+        changed = config.unlike(resume.config)
+        console.print(f"going on from step {resume.step}" + (f", with {', '.join(changed)}" if changed else ""))
     start = starting_pair(weights, config.kind) if weights is not None and resume is None else None
     if resume is not None:
-        trainer = Trainer(replace(config, settled_share=resume.config.settled_share), device, resume)
+        trainer = Trainer(config, device, resume)
     elif start is not None:
         widths = Widths.of(start.modules().state_dict())
         begun = config if fresh_decoders or config.learning == "layout" else replace(config, settled_share=1.0)
@@ -622,6 +691,13 @@ def _opened(
         trainer = Trainer(config, device)
     trainer.learn_from(*(starting_pair(teacher, config.kind) for teacher in teachers))
     return trainer, start
+
+
+def _require_onward(config: TrainConfig, resume: Checkpoint, run: Path) -> None:
+    if config.kind != resume.config.kind:
+        raise ValueError(f"{run} trains a {resume.config.kind} pair, not a {config.kind} one")
+    if config.steps < resume.step:
+        raise ValueError(f"{run} is at step {resume.step}: it cannot have {config.steps} in all")
 
 
 def _report(trainer: Trainer, recent: list[dict[str, Tensor]], test: Batch, pace: Pace) -> str:

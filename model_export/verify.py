@@ -112,5 +112,8 @@ def through_torch(
 
 
 def verify_checkpoint(checkpoint: Path, folder: Path) -> list[Difference]:
-    """Compare a model folder with the checkpoint it should have come from."""
-    return verify_pair(Checkpoint.load(checkpoint).pair(), folder)
+    """Compare a model folder with the checkpoint it should have come from; ``ValueError`` for one of another kind."""
+    pair, kind = Checkpoint.load(checkpoint).pair(), load_model_folder(folder).manifest.kind
+    if pair.kind != kind:
+        raise ValueError(f"{checkpoint} is a {pair.kind} pair, {folder} a {kind} one")
+    return verify_pair(pair, folder)

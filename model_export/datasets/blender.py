@@ -30,6 +30,7 @@ from service.optics import thin_lens
 from service.optics.light import encode_srgb
 
 BPY = "bpy==5.0.1"
+COMPLETE = "camind-complete"  # in an environment that an installation has not left half-way
 PYTHON = "python3.11"
 WORKER = Path(__file__).with_name("blender_worker.py")
 EDGE_ANGLE = math.radians(5)
@@ -95,8 +96,8 @@ def environment(folder: Path) -> Path:
     Raises ``FileNotFoundError`` without the Python that Blender is built for, ``RuntimeError`` if it cannot be
     installed.
     """
-    python = folder / "bin" / "python"
-    if python.exists():
+    python, complete = folder / "bin" / "python", folder / COMPLETE
+    if complete.exists():
         return python
     base = shutil.which(PYTHON)
     if base is None:
@@ -106,6 +107,7 @@ def environment(folder: Path) -> Path:
         if done.returncode:
             shutil.rmtree(folder, ignore_errors=True)
             raise RuntimeError(f"{' '.join(command)} failed: {done.stderr.strip()[-500:]}")
+    complete.touch()
     return python
 
 

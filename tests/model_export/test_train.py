@@ -1,6 +1,8 @@
 """Training: one seed is one run, stopped or not, and a run learns."""
 
 import copy
+import pickle
+import signal
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -14,7 +16,7 @@ import pytest
 import torch
 from rich.console import Console
 
-from model_export.config import Learning, SceneConfig, TrainConfig
+from model_export.config import LARGE_SEED, MOST_SEED, Learning, SceneConfig, TrainConfig
 from model_export.cores import torch_threads
 from model_export.folded import folded
 from model_export.losses import UPRIGHT, UPSIDE_DOWN, Batch, likeness_loss, reduced, run_pair, told_by, total_loss
@@ -23,10 +25,12 @@ from model_export.restored import restored, spread_norms
 from model_export.scenes import Material, draw_sample
 from model_export.textures import load_photographs
 from model_export.train import (
+    HELD_OUT_SEED,
     Checkpoint,
     Pools,
     Trainer,
     collate,
+    config_of,
     emphasis,
     learning_rate,
     settling_step,
@@ -47,6 +51,11 @@ def test_anything_of_a_run_can_be_set() -> None:
     assert told == replace(TrainConfig(), decay_share=0.8, scenes=replace(TrainConfig().scenes, k_cam_px=(1, 20)))
 
 
+def test_no_seed_that_is_allowed_draws_scenes_that_are_scored() -> None:
+    last = (MOST_SEED + 1) * 2**32 - 1  # of any run
+    assert last < HELD_OUT_SEED + 2**32 < LARGE_SEED * 2**32
+
+
 @pytest.mark.parametrize(
     ("setting", "said"),
     [
@@ -56,6 +65,9 @@ def test_anything_of_a_run_can_be_set() -> None:
         ("batch=many", "many is neither a number"),
         ("batch=0.5", "batch: .*integer"),
         ("scenes.k_cam_px=[1]", "scenes.k_cam_px.1: "),
+        ("scenes.k_cam_px=[20,1]", "lower"),
+        ("batch=0", "batch: "),
+        ("seed=256", "seed: "),
     ],
 )
 def test_what_is_no_setting_is_refused_by_name(setting: str, said: str) -> None:
@@ -93,6 +105,46 @@ def test_a_run_reports_and_ends_in_a_checkpoint(textures: Path, tmp_path: Path) 
     assert "step 3: loss" in said
     assert "held out" in said
     assert "scenes/s, waited" in said
+
+
+def test_a_run_that_is_gone_on_with_keeps_its_settings_and_says_what_is_new(textures: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    run(CONFIG, textures, folder)
+    again = config_of(folder, ["steps=8", "learning_rate=5e-4"])
+    assert again == replace(CONFIG, steps=8, learning_rate=5e-4)
+    checkpoint, said = run(again, textures, folder)
+    assert checkpoint.step == 8
+    assert "going on from step 6, with steps 8 for 6, learning_rate 0.0005 for 0.001" in said
+    with pytest.raises(ValueError, match="at step 8"):
+        run(config_of(folder, ["steps=7"]), textures, folder)
+    with pytest.raises(ValueError, match="trains a compact pair"):
+        run(config_of(folder, ['kind="paper"']), textures, folder)
+    with pytest.raises(ValueError, match="torch does not compute on cude"):
+        train(again, textures, folder, workers=0, device="cude")
+
+
+def test_an_interrupted_run_saves_what_it_did(textures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    advance = Trainer.advance
+
+    def interrupted(self: Trainer, batch: Batch) -> dict[str, torch.Tensor]:
+        if self.step == 1:
+            signal.raise_signal(signal.SIGINT)
+        return advance(self, batch)
+
+    monkeypatch.setattr(Trainer, "advance", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(CONFIG, textures, tmp_path / "run")
+    assert Checkpoint.load(tmp_path / "run" / "checkpoint.pt").step == 2
+    monkeypatch.undo()
+    assert run(CONFIG, textures, tmp_path / "run")[0].step == CONFIG.steps
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut off", pickle.dumps({"steps": 3}, 2)])
+def test_what_is_no_checkpoint_is_said(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "checkpoint.pt"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match="is no checkpoint of camind"):
+        Checkpoint.load(path)
 
 
 def test_the_mean_of_two_checkpoints_lies_between_them(textures: Path, tmp_path: Path) -> None:
