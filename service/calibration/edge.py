@@ -366,10 +366,10 @@ def _check(fit: EdgeFit, x_px: float, y_px: float, radius_px: float) -> None:
         raise EdgeError("what is there does not look like a blurred circle")
     if fit.semi_axes_px[0] > MOST_STRETCH * fit.semi_axes_px[1]:
         raise EdgeError("the sheet is too tilted: the circle is seen as a narrow ellipse")
-    is_elsewhere = math.dist((fit.x_px, fit.y_px), (x_px, y_px)) > MOST_SHIFT * radius_px
-    is_of_other_size = not 1 / OTHER_SIZE < fit.radius_px / radius_px < OTHER_SIZE
-    if is_elsewhere or is_of_other_size:
+    if math.dist((fit.x_px, fit.y_px), (x_px, y_px)) > MOST_SHIFT * radius_px:
         raise EdgeError("what is there is not the circle that was looked for")
+    if not 1 / OTHER_SIZE < fit.radius_px / radius_px < OTHER_SIZE:
+        raise EdgeError("the circle there is of quite another size than spacing_mm and diameter_mm say: check both")
 
 
 def _is_dark_beside(fit: EdgeFit) -> bool:
@@ -379,7 +379,7 @@ def _is_dark_beside(fit: EdgeFit) -> bool:
     distance = np.hypot(*away)
     is_outer = distance > OUTER_RADII * fit.radius_px
     is_dark = is_outer & (patch.light < DARK * np.quantile(patch.light, 0.9))
-    if is_dark.sum() < DARK_PART * is_outer.sum():
+    if not is_dark.any() or is_dark.sum() < DARK_PART * is_outer.sum():
         return False
     towards = (away[:, is_dark] / distance[is_dark]).mean(1)
     return bool(np.hypot(*towards) > ONE_SIDED)

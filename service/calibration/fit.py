@@ -30,6 +30,10 @@ OUTLIER = 5.0
 LOOSE = 0.2
 CHECKS = 40  # resamples for what the circles say of a focus distance that is given
 OFF, FAR_OFF = 1.02, 1.08  # of a focus distance that is given: from where it is warned of, and from where refused
+UNCHECKED = (
+    "all circles are on one side of the plane in focus, where they do not check focus_distance_m: k_cam_px is off by "
+    "twice as much as that is, or more; photograph both sides"
+)
 CURVE_POINTS, CURVE_BEYOND = 60, 1.05
 FENCE = 1.5  # quartile ranges beyond the quartiles: outliers as a box plot has them
 LEAST_EXCESS = 0.05
@@ -137,39 +141,40 @@ def fit_constants(
         tick()
         return _fitted(some, focus_m, start)
 
-    told = None
+    doubt = None
     if focus_distance_m is not None:
-        told = _otherwise(focus_distance_m, _own_focus(circles, partial(fit_at, None), depth_error, seed))
+        doubt = _doubt(circles, focus_distance_m, partial(fit_at, None), depth_error, seed)
     found = _constants(circles, partial(fit_at, focus_distance_m), focus_distance_m, depth_error, resamples, seed)
-    if told is None:
+    if doubt is None:
         return found
-    if found.k_cam_px.low <= 0:
+    told, is_sure = doubt
+    if is_sure and found.k_cam_px.low <= 0:
         raise FitError(told)
     return replace(found, warnings=(told, *found.warnings))
 
 
-def _own_focus(circles: Circles, fit: Fit, depth_error: float, seed: int) -> Interval | None:
-    """The focus distance that circles on both sides of it tell by themselves; None where they tell none well."""
+def _doubt(circles: Circles, given_m: float, fit: Fit, depth_error: float, seed: int) -> tuple[str, bool] | None:
+    """What circles say against a focus distance that was given, and whether they are sure: on both sides of it.
+
+    ``FitError`` where they are, and it is quite another. On one side alone they may tell it none the less; where they
+    do not, that is said.
+    """
     best = fit(circles, None)
     depth_m = circles.depth_m[~circles.is_focused]
-    if not depth_m.min() < best[2] < depth_m.max():
-        return None
+    is_sure = bool(depth_m.min() < best[2] < depth_m.max())
     drawn = _resampled(circles, fit, best, None, depth_error, CHECKS, seed)
-    k_cam, focus = (_interval(best[i], drawn[:, i], _widening(circles)) for i in (0, 2))
-    return focus if max(k_cam.relative_width, focus.relative_width) < LOOSE else None
-
-
-def _otherwise(given_m: float, own: Interval | None) -> str | None:
-    """What to say where the circles tell another focus distance than was given. ``FitError`` if quite another."""
-    if own is None or own.low / OFF <= given_m <= own.high * OFF:
+    k_cam, own = (_interval(best[i], drawn[:, i], _widening(circles)) for i in (0, 2))
+    if max(k_cam.relative_width, own.relative_width) >= LOOSE:
+        return None if is_sure else (UNCHECKED, False)
+    if own.low / OFF <= given_m <= own.high * OFF:
         return None
     told = (
         f"the photographs say {own.value:.3f} m ({own.low:.3f} to {own.high:.3f}), not the {given_m:g} m given: check "
         "focus_distance_m, or leave it out, and the sheet's spacing"
     )
-    if not 1 / FAR_OFF < given_m / own.value < FAR_OFF:
+    if is_sure and not 1 / FAR_OFF < given_m / own.value < FAR_OFF:
         raise FitError(told)
-    return told
+    return told, is_sure
 
 
 def odd_pictures(circles: Circles, constants: Constants) -> list[int]:

@@ -17,6 +17,7 @@ from service.optics.light import decode_srgb
 
 LEAST_CIRCLES = 8
 CLIPPED_LEVEL = 252
+PLATEAU, PLATEAU_CIRCLES, LEAST_PLATEAU = 0.7, 0.5, 160  # of the paper at one level, of the circles so, from where on
 OTHER_SIZE = 1.1  # paper shrinks and ink spreads less
 PAPER_FROM_RADII, PAPER_TO_RADII = 1.3, 1.6
 LUMINANCE = (0.2126, 0.7152, 0.0722)
@@ -34,6 +35,7 @@ class Measured:
     edges: list[EdgeFit] = field(default_factory=list)
     slices_px: list[float] = field(default_factory=list)  # lambda as the paper reads it, if asked for
     paper_levels: list[float] = field(default_factory=list)  # of the white around each circle looked at, 0 to 255
+    plateaus: list[int] = field(default_factory=list)  # the level of those around which nearly all white has one
 
     def view(self) -> View:
         return View(np.array(self.circles, np.int64), np.array(self.centres_px, np.float64))
@@ -109,7 +111,11 @@ def _measure_circles(
     for number in chosen:
         (x, y), radius = grid.centres_px[number].tolist(), float(grid.radii_px[number])
         at(0.1 + 0.9 * number / len(grid.radii_px))
-        out.paper_levels.append(_paper_level(peak, x - left, y - top, radius))
+        paper = _paper_about(peak, x - left, y - top, radius)
+        out.paper_levels.append(float(np.median(paper)))
+        level, share = _commonest(paper)
+        if share >= PLATEAU:
+            out.plateaus.append(level)
         try:
             if out.paper_levels[-1] >= CLIPPED_LEVEL:
                 raise EdgeError("the paper around it is overexposed: expose so that white stays grey")
@@ -123,6 +129,7 @@ def _measure_circles(
         out.circles.append(number)
         out.centres_px.append((edge.x_px + left, edge.y_px + top))
         out.edges.append(edge)
+    _warn_of_plateau(out)
     for reason, count in reasons.most_common(3):
         out.warn(f"{count} of {len(chosen)} circles not measured: {reason}")
     if every == 1 and 0 < len(out.circles) < LEAST_CIRCLES:
@@ -140,10 +147,33 @@ def _light_about(rgb: NDArray[np.uint8], grid: FoundGrid) -> tuple[int, int, NDA
     return int(low[0]), int(low[1]), np.asarray(sum(weighted), np.float32), part.max(axis=2)
 
 
-def _paper_level(peak: NDArray[np.uint8], x: float, y: float, radius: float) -> float:
-    """The median level, 0 to 255, of the paper around a circle."""
+def _warn_of_plateau(out: Measured) -> None:
+    """White that is one level nearly all over was cut off there, by light or by what made the file."""
+    level, share = _commonest(np.array(out.plateaus, np.int64))
+    if (
+        level < LEAST_PLATEAU
+        or level >= CLIPPED_LEVEL
+        or share * len(out.plateaus) < PLATEAU_CIRCLES * len(out.paper_levels)
+    ):
+        return
+    out.warn(
+        f"the paper is at level {level} nearly everywhere, as if white were cut off there, which makes blur look "
+        "smaller: expose less, and send the file as the camera wrote it"
+    )
+
+
+def _commonest(levels: NDArray[np.integer]) -> tuple[int, float]:
+    """The level that most have, and what part of them does; 0 of none."""
+    if levels.size == 0:
+        return 0, 0.0
+    counts = np.bincount(levels)
+    return int(counts.argmax()), float(counts.max() / levels.size)
+
+
+def _paper_about(peak: NDArray[np.uint8], x: float, y: float, radius: float) -> NDArray[np.uint8]:
+    """Levels, 0 to 255, of the paper around a circle; one of 0 where none is in the picture."""
     angle = np.linspace(0, 2 * np.pi, 32, endpoint=False)
     ring = np.concatenate([np.stack([np.cos(angle), np.sin(angle)], 1) * r for r in (PAPER_FROM_RADII, PAPER_TO_RADII)])
     places = np.rint(ring * radius + (x, y)).astype(int)
     inside = (places >= 0).all(1) & (places < peak.shape[::-1]).all(1)
-    return float(np.median(peak[places[inside, 1], places[inside, 0]])) if inside.any() else 0.0
+    return peak[places[inside, 1], places[inside, 0]] if inside.any() else np.zeros(1, np.uint8)

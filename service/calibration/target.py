@@ -102,19 +102,19 @@ def lay_out(grid: CircleGrid, paper: Paper) -> Sheet:
         room = (page[0] - 2 * MARGIN_MM, page[1] - 2 * MARGIN_MM - NOTES_MM)
         if width <= room[0] and height <= room[1]:
             return _filled(grid, page, room)
-    raise ValueError(
-        f"the grid is {width:.0f} x {height:.0f} mm, too large for {paper}; at most "
-        f"{_largest_spacing(grid, paper):.1f} mm spacing fits, with circles made smaller alike"
-    )
+    raise ValueError(f"the grid is {width:.0f} x {height:.0f} mm, too large for {paper}; {_what_fits(grid, paper)}")
 
 
-def _largest_spacing(grid: CircleGrid, paper: Paper) -> float:
+def _what_fits(grid: CircleGrid, paper: Paper) -> str:
     width, height = grid.size_mm
     factors = [
         min((page[0] - 2 * MARGIN_MM) / width, (page[1] - 2 * MARGIN_MM - NOTES_MM) / height)
         for page in (PAPERS_MM[paper], PAPERS_MM[paper][::-1])
     ]
-    return math.floor(grid.spacing_mm * max(factors) * 10) / 10
+    spacing_mm = math.floor(grid.spacing_mm * max(factors) * 10) / 10
+    if (grid.nearest_mm - grid.diameter_mm) / grid.spacing_mm * spacing_mm < LEAST_GAP_MM:
+        return "nor does one whose circles do not touch: print fewer rows or columns"
+    return f"at most {spacing_mm:.1f} mm spacing fits, with circles made smaller alike"
 
 
 def _filled(grid: CircleGrid, page: tuple[float, float], room: tuple[float, float]) -> Sheet:

@@ -93,7 +93,7 @@ def test_paper_that_ends_beside_the_circle_is_said(right: int, bottom: int, sigm
         (np.full((SIZE, SIZE), 0.8, np.float32), (64, 64, 24), "faint"),
         (np.zeros((SIZE, SIZE), np.float32), (64, 64, 24), "no light"),
         (np.random.default_rng(0).random((SIZE, SIZE)).astype(np.float32), (64, 64, 24), "does not look"),
-        (circle(radius=11), (64, 64, 24), "not the circle"),
+        (circle(radius=11), (64, 64, 24), "another size"),
     ],
 )
 def test_what_cannot_be_measured_is_said(

@@ -98,6 +98,15 @@ def test_a_focus_distance_that_the_pictures_contradict_is_said_and_one_far_off_i
 def test_a_focus_distance_that_one_side_does_not_tell_is_not_doubted() -> None:
     near = fit_constants(circles((0.5, 0.55, 0.6, 0.65, 0.7)), 1.3 * FOCUS, resamples=10)
     assert not any("photographs say" in warning for warning in near.warnings)
+    assert near.warnings[0].startswith("all circles are on one side")
+
+
+def test_a_focus_distance_that_one_side_tells_well_is_held_against_the_given_one() -> None:
+    near = circles((0.5, 0.6, 0.7, 0.8, 0.9, 1.0), error=0.002)
+    wrong = fit_constants(near, 1.1 * FOCUS, resamples=20)
+    assert wrong.k_cam_px.high < K_CAM
+    assert re.match(r"the photographs say 1\.(19|20)\d m", wrong.warnings[0])
+    assert not fit_constants(near, FOCUS, resamples=20).warnings
 
 
 def test_little_defocus_is_said_and_none_is_an_error() -> None:

@@ -43,6 +43,24 @@ def test_a_sheet_whose_circles_are_not_as_told_beside_their_spacing_is_noticed(
     assert [" 1.4" in warning for warning in said] == [True] * bool(wrong)
 
 
+@pytest.mark.parametrize("level", [251, 235, None])
+def test_white_that_is_cut_off_below_the_file_s_own_white_is_noticed(level: int | None) -> None:
+    rng = np.random.default_rng(3)
+    taken = photograph(rng, CAMERA, draw_pose(rng, CAMERA, SHEETS[0], 0.42), SHEETS[0], focused=False)
+    if level:
+        taken = np.minimum(taken * 1.5, level).astype(np.uint8)
+    said = [warning for warning in look(taken, SHEETS[0], None).warnings if "cut off" in warning]
+    assert [f"level {level} " in warning for warning in said] == [True] * bool(level)
+
+
+@pytest.mark.parametrize("told", [{"spacing_mm": 24.0}, {"spacing_mm": 6.0, "diameter_mm": 4.0}, {"diameter_mm": 4.0}])
+def test_what_is_told_half_or_twice_as_large_is_said_to_be_of_another_size(told: dict[str, float]) -> None:
+    rng = np.random.default_rng(3)
+    taken = photograph(rng, CAMERA, draw_pose(rng, CAMERA, SHEETS[0], 0.42), SHEETS[0], focused=False)
+    said = " ".join(look(taken, replace(SHEETS[0], **told), None).warnings)
+    assert ("of quite another size than spacing_mm and diameter_mm say" in said) == (len(told) == 1), said
+
+
 def test_a_look_stops_while_it_searches_for_the_sheet() -> None:
     calls = 0
 

@@ -123,6 +123,11 @@ def test_a_grid_too_large_names_the_spacing_that_fits() -> None:
     lay_out(CircleGrid("symmetric_circles", 10, 10, fitting, fitting * 0.75), "a4")
 
 
+def test_a_grid_that_fits_at_no_spacing_is_not_told_one() -> None:
+    with pytest.raises(ValueError, match="fewer rows or columns"):
+        lay_out(CircleGrid("asymmetric_circles", 2, 40, 10.0, 12.0), "a4")
+
+
 @pytest.fixture(scope="module")
 def client() -> TestClient:
     return TestClient(create_app(Settings()))
