@@ -199,13 +199,13 @@ function tellTaken(error) {
 	throw new Problem({ ...problem, detail, errors: [{ pointer: "#/name", detail }] });
 }
 
-/** @returns {Promise<any[]>} the cameras as they are now, by name */
-export async function everyCamera() {
+/** @param {RequestOptions} [options] @returns {Promise<any[]>} the cameras as they are now, by name */
+export async function everyCamera(options) {
 	const found = [];
 	let cursor = null;
 	do {
 		const after = cursor === null ? "" : `&cursor=${encodeURIComponent(cursor)}`;
-		const page = await getJson(`cameras?limit=200${after}`);
+		const page = await getJson(`cameras?limit=200${after}`, options);
 		found.push(...page.items);
 		cursor = page.next_cursor;
 	} while (cursor !== null);

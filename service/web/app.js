@@ -82,20 +82,26 @@ function App() {
 	const [said, setSaid] = useState("");
 	const [hasKey, setHasKey] = useState(storedKey() !== null);
 
-	const reloadCameras = useCallback(async () => {
+	const load = useCallback(async (/** @type {boolean} */ asks) => {
 		try {
-			setCameras(await everyCamera());
+			setCameras(await everyCamera({ asks }));
 			setProblem(null);
 		} catch (error) {
-			setProblem(problemOf(error));
+			const met = problemOf(error);
+			if (asks) setProblem(met);
 		}
 	}, []);
+	const reloadCameras = useCallback(() => load(true), []);
 	const announce = useCallback((/** @type {string} */ text) => {
 		// the same words again are said again
 		setSaid((before) => (before === text ? `${text}\u00a0` : text));
 	}, []);
 	useEffect(() => {
 		reloadCameras();
+		// some may have been made or changed elsewhere
+		const look = () => document.hidden || load(false);
+		document.addEventListener("visibilitychange", look);
+		return () => document.removeEventListener("visibilitychange", look);
 	}, []);
 	useEffect(() => {
 		function onKeyChanged() {

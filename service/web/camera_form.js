@@ -2,7 +2,7 @@
 
 import { Problem, getJson, problemOf, sendJson, storeCamera } from "./api.js";
 import { CameraCurve } from "./camera_curve.js";
-import { BLANK, SENSOR_WIDTH, bodyOf, differences, fieldsOf, filledIn, missingOf } from "./camera_specs.js";
+import { BLANK, SENSOR_WIDTH, bodyOf, differences, fieldsOf, filledIn, missingOf, numbersOf } from "./camera_specs.js";
 import { PHOTOGRAPHS, mediaTypeOf } from "./photograph_files.js";
 import { ProblemBox, Warnings, useProblem } from "./problem_box.js";
 import { Table } from "./table.js";
@@ -33,7 +33,7 @@ export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 	const [isSaving, setIsSaving] = useState(false);
 	const { preview, faults: previewFaults } = usePreview(fields);
 	const title = useRef(/** @type {HTMLHeadingElement | null} */ (null));
-	const faults = [...previewFaults, ...(problem?.errors ?? [])];
+	const faults = [...unclear(fields), ...previewFaults, ...(problem?.errors ?? [])];
 	const missing = missingOf(fields);
 
 	useEffect(() => arriveAt(title.current), []);
@@ -194,6 +194,12 @@ export function Field({ path, label, value, form = "camera", kind = "decimal", h
 		...${{ id: `${form}-${path.replace("/", "-")}`, label, value, kind, fault, hint, disabled }}
 		onInput=${(/** @type {string} */ text) => onChange({ [path]: text })}
 	/>`;
+}
+
+/** @param {Fields} fields @returns {import("./api.js").FieldProblem[]} */
+function unclear({ "intrinsics/distortion": text = "" }) {
+	const detail = "It is not clear which commas are decimal: put spaces or semicolons between the numbers.";
+	return numbersOf(text) || !text.includes(",") ? [] : [{ pointer: "#/intrinsics/distortion", detail }];
 }
 
 /**

@@ -19,6 +19,8 @@ const NEEDED_OF_LENS = {
 	"lens/sensor_width_px": "sensor width",
 };
 
+const NUMBER = /^[-+]?(\d+([.,]\d+)?|\d+\.|\.\d+)(e[-+]?\d+)?$/i;
+
 /** What is asked for as a sensor's width. */
 export const SENSOR_WIDTH = "pixels across the full-size photograph the camera takes";
 
@@ -95,7 +97,7 @@ export function bodyOf(fields) {
 	const distortion = text("intrinsics/distortion");
 	if (pinhole.length > 0 || distortion) {
 		body.intrinsics = Object.fromEntries(pinhole.map((name) => [name, number(`intrinsics/${name}`)]));
-		body.intrinsics.distortion = distortion.split(/[\s,]+/).filter(Boolean).map(toNumber);
+		body.intrinsics.distortion = numbersOf(distortion) ?? [distortion];
 	}
 	return body;
 }
@@ -119,6 +121,21 @@ export function differences(before, after) {
 	return paths
 		.filter((path) => (from[path] ?? "") !== (to[path] ?? ""))
 		.map((path) => ({ path, before: from[path] ?? "", after: to[path] ?? "" }));
+}
+
+/**
+ * Numbers apart by spaces or semicolons, with points or commas; or by commas, where those can be nothing else.
+ *
+ * @param {string} text
+ * @returns {number[] | null} null where it is not clear which numbers are meant
+ */
+export function numbersOf(text) {
+	const apart = (/** @type {RegExp} */ separator) => {
+		const parts = text.split(separator).filter(Boolean);
+		return parts.every((part) => NUMBER.test(part)) ? parts.map(decimal) : null;
+	};
+	const isList = !/,\S/.test(text) || /^[^\s;]*\.[^\s;]*$/.test(text);
+	return apart(/[\s;]+/) ?? (isList ? apart(/[\s,]+/) : null);
 }
 
 /** @param {string} text */

@@ -143,6 +143,7 @@ export function CamerasView({ shown, cameras, camera, reloadCameras, go, announc
 						}}
 						onCancel=${() => show(open.kind === "edit" ? open.camera.name : null)}
 					/>`}
+					${open.kind === "read" && cameras && !read && html`<p class="notice">There is no camera ${open.name}.</p>`}
 					${read &&
 					html`<${CameraCard}
 						key=${`${read.name} ${read.revision}`}
@@ -213,7 +214,7 @@ function CameraCard({ camera, opened, go, onEdit, onDeleted, onStale }) {
 				${intrinsics &&
 				html`<dt>Intrinsics</dt>
 					<dd>
-						fx ${short(intrinsics.fx_px, 5)}, fy ${short(intrinsics.fy_px, 5)}, cx ${short(intrinsics.cx_px, 5)}, cy
+						fx ${short(intrinsics.fx_px, 5)}, fy ${short(intrinsics.fy_px, 5)}, cx ${short(intrinsics.cx_px, 5)}, cy${" "}
 						${short(intrinsics.cy_px, 5)}${intrinsics.distortion.length > 0 &&
 						`; distortion ${intrinsics.distortion.map((/** @type {number} */ term) => short(term)).join(", ")}`}
 					</dd>`}

@@ -10,6 +10,7 @@ const RIGHT = 14;
 const TOP = 14;
 const BOTTOM = 46;
 const LINE = 16; // so that two words never run into each other
+const LETTER = 7; // as wide as one may be
 const MOST_ROWS = 30;
 
 /** @typedef {{x: number, y: number, low?: number, high?: number, label?: string}} Point */
@@ -58,7 +59,9 @@ export function Chart({ title, x, y, series, marks = [] }) {
 				<line class="axis" x1=${LEFT} x2=${width - RIGHT} y1=${HEIGHT - BOTTOM} y2=${HEIGHT - BOTTOM} />
 				${marks.map((mark, row) => {
 					const at = across.scale(mark.x);
-					const [aside, anchor] = at > width / 2 ? [-5, "end"] : [5, "start"];
+					const isLeft = marks.length > 1 ? marks.every(({ x }) => x >= mark.x) : at > width / 2;
+					const room = isLeft ? at - LEFT : width - RIGHT - at;
+					const [aside, anchor] = isLeft === room > mark.label.length * LETTER ? [-5, "end"] : [5, "start"];
 					return html`<g class="mark">
 						<line x1=${at} x2=${at} y1=${TOP} y2=${HEIGHT - BOTTOM} />
 						<text x=${at + aside} y=${TOP + 10 + row * LINE} text-anchor=${anchor}>${mark.label}</text>

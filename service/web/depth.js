@@ -45,6 +45,7 @@ const SIDES = [
 ];
 const PHOTOGRAPH_MOST_PX = 1600;
 const NOT_THE_FRAME = "urn:camind:problem:image-size-mismatch";
+const NO_PHOTOGRAPH = /:(invalid-image|unsupported-kind)$/;
 /** @type {Look} */
 const FIRST_LOOK = { map: "cividis", nearM: 1, farM: 2, hatchesNothing: true, dotsEither: true };
 
@@ -64,6 +65,8 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 	const [isDrafting, setIsDrafting] = useState(false);
 	const [phase, setPhase] = useState(/** @type {Phase | null} */ (null));
 	const [problem, setProblem] = useProblem();
+	/** Why there is no reading, also when it was dismissed. */
+	const [failure, setFailure] = useProblem();
 	const [result, setResult] = useState(/** @type {Result | null} */ (null));
 	const [look, setLook] = useState(FIRST_LOOK);
 	const [isOpening, setIsOpening] = useState(false);
@@ -74,6 +77,8 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 	const [measured, setMeasured] = useState(/** @type {Measured | null} */ (null));
 	const running = useRef(/** @type {AbortController | null} */ (null));
 	const newest = useRef(/** @type {File | null} */ (null));
+	/** The camera and revision that was read by before the page knew it. */
+	const ahead = useRef("");
 
 	const camera = cameras?.find((one) => one.name === name) ?? null;
 	const ask = { camera: name, side, focusM, known };
@@ -93,6 +98,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 	const take = useCallback(async (/** @type {File | null | undefined} */ taken) => {
 		if (!taken) return;
 		setResult(null);
+		setFailure(null);
 		setReading(null);
 		setMarks([]);
 		setKnown([]);
@@ -133,6 +139,9 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 			setPhase(null);
 			return undefined;
 		}
+		const isRead = ahead.current === `${name} ${camera.revision}`;
+		ahead.current = "";
+		if (isRead) return undefined;
 		const abort = new AbortController();
 		running.current = abort;
 		run(file, abort.signal);
@@ -143,6 +152,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 	async function run(sent, signal) {
 		const show = (/** @type {Phase | null} */ next) => signal.aborted || setPhase(next);
 		setProblem(null);
+		setFailure(null);
 		show({ step: "upload", fraction: 0 });
 		announce("Sending the photograph.");
 		try {
@@ -173,24 +183,32 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 			setReading(null);
 			setMarks((before) => [...before]);
 			setPhase(null);
+			const revision = Number(answer.headers.get("Camind-Camera-Revision"));
+			if (revision !== camera?.revision) {
+				ahead.current = `${name} ${revision}`;
+				reloadCameras();
+			}
 			announce(
 				spread
 					? `Depth is ready: ${spread.nearM.toFixed(2)} to ${spread.farM.toFixed(2)} metres.`
 					: "The photograph gives no answer.",
 			);
 		} catch (error) {
-			if (signal.aborted) return;
-			setResult(null);
-			setPhase(null);
-			setProblem(error instanceof Problem ? withSize(error) : unreadable(error));
+			if (!signal.aborted) fail(error instanceof Problem ? withSize(error) : unreadable(error));
 		}
+	}
+
+	/** @param {Problem} why */
+	function fail(why) {
+		setPhase(null);
+		setResult(null);
+		setProblem(why);
+		setFailure(why);
 	}
 
 	function cancel() {
 		running.current?.abort();
-		setPhase(null);
-		setResult(null);
-		setProblem(new Problem({ status: 0, title: "Cancelled.", detail: "The service has stopped working on it." }));
+		fail(new Problem({ status: 0, title: "Cancelled.", detail: "The service has stopped working on it." }));
 		announce("Cancelled.");
 	}
 
@@ -217,7 +235,9 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 							${(cameras ?? []).map((one) => html`<option key=${one.name} value=${one.name}>${one.name}</option>`)}
 						</select>
 					</label>
-					${camera && html`<p class="hint">${about(camera)}</p>`}
+					${camera
+						? html`<p class="hint">${about(camera)}</p>`
+						: name && cameras && html`<p class="notice">There is no camera ${name}.</p>`}
 					${cameras?.length === 0 &&
 					html`<p class="hint">
 						No camera is stored yet. Give a photograph, and its EXIF drafts one; or${" "}
@@ -255,16 +275,22 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 				key=${file}
 				file=${file}
 				mediaType=${mediaTypeOf(/** @type {File} */ (file))}
+				onFailed=${setFailure}
 				onStored=${async (/** @type {string} */ stored) => {
 					await reloadCameras();
 					setProblem(null);
 					go("depth", { camera: stored, replaces: true });
 				}}
 			/>`}
+			${failure &&
+			!problem &&
+			file &&
+			camera &&
+			html`<div class="row"><button type="button" class="primary" onClick=${again}>Read the depth</button></div>`}
 			<${Progress} phase=${phase} onCancel=${cancel} />
 
 			${size === null
-				? html`<${DropPlace} file=${file} isOpening=${isOpening} />`
+				? html`<${DropPlace} ...${{ file, isOpening }} isRefused=${failure && NO_PHOTOGRAPH.test(failure.type)} />`
 				: html`<div class=${`depth-grid ${phase && result ? "depth-stale" : ""}`}>
 						<div class="stack">
 							${result &&
@@ -300,15 +326,17 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 							</div>`}
 							${result?.facts.spread && html`<${Legend} look=${look} counts=${counts} />`}
 						</div>
-						${result &&
+						${(result || known.length > 0) &&
 						html`<div class="stack depth-side-panel">
-							<${Warnings} texts=${warned("result")} />
-							<${Readout} reading=${reading} />
-							<${Distance} ...${{ marks, measured }} hasPoints=${result.facts.hasPoints} onClear=${() => setMarks([])} />
+							${result &&
+							html`<${Warnings} texts=${warned("result")} />
+								<${Readout} reading=${reading} />
+								<${Distance} ...${{ marks, measured }} hasPoints=${result.facts.hasPoints} onClear=${() => setMarks([])} />`}
 							<${Tape} mark=${marks.at(-1) ?? null} known=${known} onKnown=${setKnown} />
-							<${Colours} look=${look} facts=${result.facts} onLook=${setLook} />
-							<${Exports} key=${result.model + JSON.stringify(result.asked)} result=${result} announce=${announce} />
-							<${Timings} timings=${result.timings} model=${result.model} />
+							${result &&
+							html`<${Colours} look=${look} facts=${result.facts} onLook=${setLook} />
+								<${Exports} key=${result.model + JSON.stringify(result.asked)} result=${result} announce=${announce} />
+								<${Timings} timings=${result.timings} model=${result.model} />`}
 						</div>`}
 					</div>`}
 		</div>
@@ -331,8 +359,8 @@ function useFilesFromOutside(shown, take) {
 	}, [shown]);
 }
 
-/** @param {{file: File | null, isOpening: boolean}} props */
-function DropPlace({ file, isOpening }) {
+/** @param {{file: File | null, isOpening: boolean, isRefused: boolean | null}} props */
+function DropPlace({ file, isOpening, isRefused }) {
 	const [isOver, setIsOver] = useState(false);
 	return html`<div
 		class=${isOver ? "drop over depth-drop" : "drop depth-drop"}
@@ -345,7 +373,7 @@ function DropPlace({ file, isOpening }) {
 			${file
 				? isOpening
 					? "Opening it ..."
-					: "This browser cannot show it; the service may still read it."
+					: `This browser cannot show it; the service ${isRefused ? "cannot read it either" : "may still read it"}.`
 				: "The whole frame as the camera stored it: a crop has lost its scale. It is read, and not kept."}
 		</p>
 	</div>`;

@@ -15,8 +15,9 @@ const NUMBERS = [
 	["lens/sensor_width_px", "Sensor width (px)", SENSOR_WIDTH],
 ];
 
-/** @param {{file: File, mediaType: string, onStored: (name: string) => Promise<void>}} props */
-export function DraftForm({ file, mediaType, onStored }) {
+/** @param {{file: File, mediaType: string, onStored: (name: string) => Promise<void>,
+ *   onFailed: (why: import("./api.js").Problem) => void}} props */
+export function DraftForm({ file, mediaType, onStored, onFailed }) {
 	const [draft, setDraft] = useState(/** @type {any} */ (null));
 	const [fields, setFields] = useState(/** @type {import("./camera_specs.js").Fields} */ ({}));
 	const [problem, setProblem] = useProblem();
@@ -30,7 +31,11 @@ export function DraftForm({ file, mediaType, onStored }) {
 				setDraft(body);
 				setFields(fieldsOf(body));
 			})
-			.catch((error) => abort.signal.aborted || setProblem(problemOf(error)));
+			.catch((error) => {
+				if (abort.signal.aborted) return;
+				setProblem(problemOf(error));
+				onFailed(error);
+			});
 		return () => abort.abort();
 	}, [file]);
 

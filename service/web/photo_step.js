@@ -87,19 +87,33 @@ export function Photographs({ photos, query, focus, onChange, announce }) {
 	const waiting = photos.filter(({ asked }) => asked !== query).length;
 	const seen = photos.filter(({ look }) => look?.found).map(seenOf);
 	const next = adviceFor(seen, focus);
+	const [known, setKnown] = useState("");
 	useEffect(() => {
 		if (photos.length > 0 && waiting === 0) announce(`The sheet is found in ${seen.length} of ${counted(photos.length, "photograph")}. ${next}`);
 	}, [waiting === 0, photos.length]);
 
+	/** @param {File[]} files @param {Role} role */
+	function add(files, role) {
+		const isThere = (/** @type {File} */ { name, size, lastModified: at }) =>
+			photos.some(({ role: its, file }) => its === role && file.name === name && file.size === size && file.lastModified === at);
+		const others = files.filter((file) => !isThere(file));
+		const skipped = files.length - others.length;
+		const words = skipped ? `${counted(skipped, "photograph was", "photographs were")} there already.` : "";
+		setKnown(words);
+		if (words) announce(words);
+		onChange((before) => [...before, ...photosOf(others, role)]);
+	}
+
 	return html`
 		<div class="columns">
-			${ROLES.map((one) => html`<${DropZone} key=${one.role} ...${one} onFiles=${(/** @type {File[]} */ files) => onChange((before) => [...before, ...photosOf(files, one.role)])} />`)}
+			${ROLES.map((one) => html`<${DropZone} key=${one.role} ...${one} onFiles=${(/** @type {File[]} */ files) => add(files, one.role)} />`)}
 		</div>
 		<div class="notice next">
 			<p>
 				<strong>${next}</strong>
 				${photos.length > 0 && html` <span>${`The sheet is found in ${seen.length} of ${counted(photos.length, "photograph")}; ${WANTED} to 12 make a good set.`}</span>`}
 			</p>
+			${known && html`<p class="hint">${known}</p>`}
 			${waiting > 0 && html`<p class="hint">Looking at ${counted(waiting, "photograph")} ...</p>`}
 		</div>
 		${photos.length > 0 &&

@@ -9,6 +9,7 @@ import { html, useEffect, useMemo, useRef, useState } from "./vendor/preact.js";
 
 const MOST_PX = 2000;
 const DIVIDER_REACH_PX = 14;
+const CLICK_PX = 3; // what moves less is no drag
 const LARGE_STEPS = 20;
 const STILL_MS = 500;
 const HINT = "depth-stage-hint";
@@ -37,7 +38,7 @@ export function Stage(props) {
 	const [divider, setDivider] = useState(0);
 	const [painted, setPainted] = useState(/** @type {ImageBitmap | null} */ (null));
 	const paintPx = usePaintPx(stage, size);
-	const isDragging = useRef(false);
+	const drag = useRef(/** @type {{x: number, y: number, hasMoved: boolean} | null} */ (null));
 	const isByKeys = useRef(false);
 
 	const paint = useMemo(
@@ -85,18 +86,20 @@ export function Stage(props) {
 	function onPointerDown(event) {
 		const box = boxOf();
 		const at = box.left + (divider / 100) * box.width;
-		isDragging.current = Math.abs(event.clientX - at) < DIVIDER_REACH_PX;
+		const { clientX: x, clientY: y } = event;
+		drag.current = Math.abs(x - at) < DIVIDER_REACH_PX ? { x, y, hasMoved: false } : null;
 		isByKeys.current = false;
-		if (!isDragging.current) return;
+		if (drag.current === null) return;
 		stage.current?.setPointerCapture(event.pointerId);
 		event.preventDefault();
 	}
 
 	/** @param {PointerEvent} event */
 	function onPointerMove(event) {
-		if (isDragging.current) {
+		if (drag.current) {
 			const box = boxOf();
-			setDivider(Math.min(100, Math.max(0, (100 * (event.clientX - box.left)) / box.width)));
+			drag.current.hasMoved ||= Math.hypot(event.clientX - drag.current.x, event.clientY - drag.current.y) >= CLICK_PX;
+			if (drag.current.hasMoved) setDivider(Math.min(100, Math.max(0, (100 * (event.clientX - box.left)) / box.width)));
 		} else {
 			isByKeys.current = false;
 			if (result) read(pixelAt(event));
@@ -105,9 +108,9 @@ export function Stage(props) {
 
 	/** @param {PointerEvent} event */
 	function onPointerUp(event) {
-		const wasDragging = isDragging.current;
-		isDragging.current = false;
-		if (wasDragging || !result || event.button !== 0) return;
+		const hasMoved = drag.current?.hasMoved;
+		drag.current = null;
+		if (hasMoved || !result || event.button !== 0) return;
 		read(pixelAt(event));
 		mark(pixelAt(event));
 	}
@@ -255,9 +258,9 @@ function Marks({ size, reading, marks, measured, known }) {
 	`;
 }
 
-/** Words beside a place, inside the picture. @param {{left: number, top: number, isBelow: boolean, name: string, children?: any}} props */
+/** Words above or below a place, as far to its left as keeps them inside the picture. @param {{left: number, top: number, isBelow: boolean, name: string, children?: any}} props */
 function Label({ left, top, isBelow, name, children }) {
-	const across = left > 0.6 ? "calc(-100% - 10px)" : "10px";
+	const across = `${-100 * left}%`;
 	const down = isBelow ? "10px" : "calc(-100% - 10px)";
 	const style = { left: `${100 * left}%`, top: `${100 * top}%`, transform: `translate(${across}, ${down})` };
 	return html`<span class="depth-label" data-label=${name} style=${style} aria-hidden="true">${children}</span>`;

@@ -3,7 +3,7 @@
 import { decimal } from "./numbers.js";
 import { metres } from "./readout.js";
 import { TextField } from "./text_field.js";
-import { html, useState } from "./vendor/preact.js";
+import { html, useRef, useState } from "./vendor/preact.js";
 
 /** @typedef {{u: number, v: number, depthM: number}} KnownDepth */
 
@@ -20,6 +20,7 @@ const FARTHEST_M = 99_999;
 export function Tape({ mark, known, onKnown }) {
 	const [text, setText] = useState("");
 	const [fault, setFault] = useState("");
+	const title = useRef(/** @type {HTMLHeadingElement | null} */ (null));
 
 	/** @param {Event} event */
 	function add(event) {
@@ -37,7 +38,7 @@ export function Tape({ mark, known, onKnown }) {
 	}
 
 	return html`<section class="card stack" aria-label="Known by a tape">
-		<h3>Known by a tape</h3>
+		<h3 tabindex="-1" ref=${title}>Known by a tape</h3>
 		${mark === null
 			? html`<p class="hint">
 					Click what you have measured, and say how far it is. Two or three things, near and far, tell where the lens was
@@ -66,7 +67,10 @@ export function Tape({ mark, known, onKnown }) {
 					<button
 						type="button"
 						aria-label=${`Forget ${metres(one.depthM)} at ${one.u}, ${one.v}`}
-						onClick=${() => onKnown(known.filter((other) => other !== one))}
+						onClick=${() => {
+							onKnown(known.filter((other) => other !== one));
+							title.current?.focus();
+						}}
 					>
 						Forget
 					</button>

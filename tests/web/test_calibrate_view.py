@@ -123,6 +123,18 @@ def test_every_photograph_says_at_once_what_it_shows(
     assert page.evaluate(OVERFLOW) <= 0
 
 
+def test_the_same_photograph_again_is_no_other(page: Page, photographs: list[Path], name: str) -> None:
+    to_photographs(page, name)
+    shown = page.get_by_role("list", name="Photographs").get_by_role("listitem")
+    drop(page, photographs[0])
+    expect(shown).to_have_count(1)
+    drop(page, *photographs[:2])
+    expect(shown).to_have_count(2)
+    expect(page.get_by_text("1 photograph was there already.")).to_have_count(2)  # seen, and said aloud
+    drop(page, photographs[0], role="focused")
+    expect(shown).to_have_count(3)
+
+
 @pytest.mark.parametrize(
     ("orientation", "corner"),
     [(1, "upper left"), (3, "lower right"), (6, "upper right"), (8, "lower left")],

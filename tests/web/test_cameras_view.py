@@ -88,6 +88,51 @@ def test_a_fault_is_shown_at_its_field(page: Page, expected_errors: list[str]) -
     expect(page.get_by_label("Focal length (mm)")).to_have_accessible_description(re.compile("cannot focus at 2 m"))
 
 
+@pytest.mark.parametrize(
+    ("typed", "numbers"),
+    [
+        ("-0,21 0,08 0,001 -0,002", [-0.21, 0.08, 0.001, -0.002]),
+        ("-0,21; 8e-2;0; -.5", [-0.21, 0.08, 0, -0.5]),
+        ("-0.21, 0.08,\n0, 1", [-0.21, 0.08, 0, 1]),
+        ("-0.21,0.08,0,0", [-0.21, 0.08, 0, 0]),
+        (" ", []),
+        ("0,1,0,2", None),
+        ("0,1, 0,2", None),
+        ("0,1 0,2,0,3", None),
+        ("0.1,0.2 0,3", None),
+    ],
+)
+def test_commas_are_decimal_where_spaces_separate(page: Page, typed: str, numbers: list[float] | None) -> None:
+    page.goto("#cameras")
+    asked = "async (typed) => (await import('/web/camera_specs.js')).numbersOf(typed)"
+    assert page.evaluate(asked, typed) == numbers
+
+
+def test_commas_that_may_be_either_are_a_fault(
+    page: Page, served: Server, phone: dict[str, Any], expected_errors: list[str]
+) -> None:
+    expected_errors.append("status of 422")
+    open_camera(page, served, phone | {"intrinsics": LENS_OF_ITS_SIZE})
+    expect(page.get_by_text("cy 1500", exact=False)).to_be_visible()
+    page.get_by_role("button", name="Edit", exact=True).click()
+    page.get_by_text("More: gamma").click()
+    distortion = page.get_by_label("Distortion")
+    distortion.fill("-0,21,0,08,0,001,-0,002")
+    expect(distortion).to_have_accessible_description(re.compile("not clear which commas"))
+    page.get_by_role("button", name="Save as a new revision").click()
+    expect(page.get_by_role("alert")).to_be_visible()
+    distortion.fill("-0,21 0,08 0,001 -0,002")
+    page.get_by_role("button", name="Save as a new revision").click()
+    expect(page.get_by_text("revision 2", exact=True)).to_be_visible()
+    assert read(served, phone["name"])["intrinsics"]["distortion"] == [-0.21, 0.08, 0.001, -0.002]
+
+
+def test_a_camera_that_is_not_there_is_said_to_be_missing(page: Page) -> None:
+    for tab in ("cameras", "depth"):
+        page.goto(f"#{tab}/nosuch")
+        expect(page.get_by_role("tabpanel").get_by_text("There is no camera nosuch.")).to_be_visible()
+
+
 def test_a_name_that_is_taken_is_told(
     page: Page, served: Server, phone: dict[str, Any], expected_errors: list[str]
 ) -> None:
@@ -368,4 +413,9 @@ def test_cameras_fit_a_phone_and_the_dark(
     open_camera(page, served, d200)
     expect(page.get_by_role("img", name="Blur against distance")).to_be_visible()
     assert page.evaluate(OVERFLOW) <= 0
+    lines, words = ([one.bounding_box() for one in page.locator(f".mark {kind}").all()] for kind in ("line", "text"))
+    left, right = sorted(
+        (line["x"], word["x"], word["width"]) for line, word in zip(lines, words, strict=True) if line and word
+    )
+    assert left[1] + left[2] < left[0] < right[0] < right[1]
     assert barriers(page) == []

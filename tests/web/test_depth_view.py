@@ -288,6 +288,14 @@ def test_the_divider_uncovers_the_photograph(measured: Page) -> None:
     box = stage(measured).bounding_box()
     assert box is not None
     middle = box["y"] + box["height"] / 2
+    # at its very place a press is a click, where nothing is moved
+    measured.mouse.move(box["x"] + 2, middle)
+    measured.mouse.down()
+    measured.mouse.move(box["x"] + 3, middle + 1)
+    measured.mouse.up()
+    expect(slider).to_have_value("0")
+    measured.get_by_role("button", name="Clear points").click()
+    expect(measured.get_by_role("heading", name="Distance in space")).to_be_focused()
     measured.mouse.move(box["x"] + 2, middle)
     measured.mouse.down()
     measured.mouse.move(box["x"] + box["width"] / 2, middle, steps=3)
@@ -353,8 +361,67 @@ def test_what_a_tape_says_moves_the_focus_and_can_be_forgotten(
     expect(measured.locator(".depth-taped")).to_have_count(1)
     with measured.expect_response(lambda answer: "/depth?" in answer.url):
         known.get_by_role("button", name="Forget 1.500 m at 322, 216").click()
+    expect(known.get_by_role("heading")).to_be_focused()
     reads("")
     expect(measured.locator(".depth-taped")).to_have_count(0)
+
+
+def test_after_a_failed_reading_one_may_forget_a_depth_or_read_again(
+    measured: Page, expected_errors: list[str]
+) -> None:
+    expected_errors.append(REFUSED)
+    picture = stage(measured)
+    picture.click(position=place_of(picture, 322, 216))
+    field = measured.get_by_label("From the lens to 322, 216 in m")
+    field.fill("1.5")
+    measured.route("**/depth?*", lambda route: route.abort())
+    field.press("Enter")
+    alert, again = measured.get_by_role("alert"), measured.get_by_role("button", name="Read the depth")
+    expect(alert).to_contain_text("The service does not answer.")
+    expect(again).to_have_count(0)
+    alert.get_by_role("button", name="Dismiss").click()
+    expect(again).to_be_visible()
+    measured.unroute("**/depth?*")
+    with measured.expect_request(lambda request: "known=322%2C216%2C1.5" in request.url):
+        again.click()
+    measured.get_by_role("button", name="Cancel").click()
+    measured.get_by_role("button", name="Forget 1.500 m at 322, 216").click()
+    stage(measured)
+    expect(again).to_have_count(0)
+
+
+def test_a_camera_that_was_changed_elsewhere_is_told_by_its_new_numbers(
+    opened: Page, served: Server, d200: dict[str, Any]
+) -> None:
+    served.add({**d200, "name": "changing"})
+    opened.reload()
+    choose(opened, "changing")
+    give(opened)
+    stage(opened)
+    asked: list[str] = []
+    opened.on("request", lambda request: asked.append(request.url) if "/depth?" in request.url else None)
+    changed = json.dumps({**d200, "name": "changing", "focus_distance_m": 2.5})
+    served.ask("PUT", "/cameras/changing", changed, {"Content-Type": "application/json"})
+    opened.get_by_role("combobox", name="Side of the plane in focus").select_option("near")
+    expect(opened.get_by_text("focused at 2.5 m")).to_be_visible()
+    stage(opened)
+    # one that was made elsewhere, when the page comes to the front again
+    served.add({**d200, "name": "elsewhere"})
+    opened.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
+    expect(opened.get_by_role("option", name="elsewhere")).to_have_count(1)
+    assert len(asked) == 1
+    for name in ("changing", "elsewhere"):
+        served.ask("DELETE", f"/cameras/{name}")
+    opened.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
+    expect(opened.get_by_text("There is no camera changing.")).to_be_visible()
+
+
+def test_what_is_no_photograph_is_not_said_to_be_readable(opened: Page, expected_errors: list[str]) -> None:
+    expected_errors.append(REFUSED)
+    choose(opened)
+    give(opened, b"no picture")
+    expect(opened.get_by_role("alert")).to_be_visible()
+    expect(opened.get_by_text("the service cannot read it either")).to_be_visible()
 
 
 def test_points_in_space_are_drawn_turned_and_counted(measured: Page, maps: Callable[..., Any]) -> None:
@@ -377,7 +444,7 @@ def test_points_in_space_are_drawn_turned_and_counted(measured: Page, maps: Call
 
 def test_nothing_keeps_people_out(measured: Page, barriers: Callable[[Page], list[str]]) -> None:
     picture = stage(measured)
-    for u in (200, 400):
+    for u in (320, 440):
         picture.click(position=place_of(picture, u, 216))
     measured.get_by_role("button", name="Copy as curl").click()
     measured.get_by_text("The service took").click()
@@ -387,6 +454,10 @@ def test_nothing_keeps_people_out(measured: Page, barriers: Callable[[Page], lis
         assert barriers(measured) == [], scheme
     measured.set_viewport_size({"width": 360, "height": 640})
     assert measured.evaluate(OVERFLOW) <= 0
+    label, box = measured.locator("[data-label=distance]").bounding_box(), picture.bounding_box()
+    assert label is not None
+    assert box is not None
+    assert box["x"] <= label["x"] < label["x"] + label["width"] <= box["x"] + box["width"]
     measured.get_by_role("tab", name="3D").click()
     assert barriers(measured) == []
 
@@ -538,6 +609,7 @@ def test_the_focus_of_one_shot_is_no_other_s(opened: Page, served: Server, d200:
     opened.reload()
     focus = opened.get_by_label("Focus distance of this shot")
     choose(opened)
+    expect(focus).to_have_accessible_description(re.compile("Left empty"))  # what was there before is forgotten
     focus.fill("far")
     expect(focus).to_have_accessible_description("This is no distance in metres.")
     give(opened)
