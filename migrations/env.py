@@ -4,7 +4,7 @@ from alembic import context
 from sqlalchemy import Connection
 
 from service.config import load_settings
-from service.storage.engine import open_engine
+from service.storage.engine import open_engine, unhurried
 from service.storage.tables import metadata
 
 
@@ -26,9 +26,8 @@ def main() -> None:
     if isinstance(given, Connection):
         run(given)
         return
-    with open_engine(load_settings().effective_database_url).connect() as connection:
+    with open_engine(load_settings().effective_database_url).connect() as connection, unhurried(connection):
         run(connection)
-        connection.commit()
 
 
 main()

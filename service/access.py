@@ -105,7 +105,10 @@ def is_from_another_site(headers: Headers) -> bool:
     site, origin = headers.get("sec-fetch-site"), headers.get("origin")
     if site is not None:
         return site in ("cross-site", "same-site")
-    return origin is not None and urlsplit(origin).netloc != headers.get("host")
+    try:
+        return origin is not None and urlsplit(origin).netloc != headers.get("host")
+    except ValueError:
+        return True  # no page has an origin that is no address
 
 
 def is_own_name(host: str, hosts: Collection[str] = ()) -> bool:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 GROUP = "camind.commands"
 WRONG_USE = 2
+MOST_DAYS = 36_500.0  # the calendar has an end
 
 app = typer.Typer(
     help="Metres from one photograph, for any camera.",
@@ -118,13 +119,16 @@ def restore(
 ) -> None:
     """Put a backup in the SQLite database's place, at the newest schema; no service may use it meanwhile.
 
-    The database that was there is kept beside it under a dated name.
+    The database that was there is kept beside it under a dated name. Calibrations whose photographs are in another data
+    folder than this one fail.
     """
     from service.storage.backup import restore as put_back
+    from service.storage.spool import known_id
 
-    database = _database_file(_settings())
+    settings = _settings()
+    database = _database_file(settings)
     with _plain_failures():
-        contents, kept = put_back(file, database)
+        contents, kept = put_back(file, database, known_id(settings.spool_dir))
     typer.echo(f"{database} holds {contents}")
     if kept is not None:
         typer.echo(f"What was there before is {kept}")
@@ -333,7 +337,9 @@ def create_key(
     owner: Annotated[
         str | None, typer.Option(help="Whose cameras and calibrations it works with. [default: its name]")
     ] = None,
-    days: Annotated[float | None, typer.Option(help="How long it is good. [default: for ever]", min=0.0)] = None,
+    days: Annotated[
+        float | None, typer.Option(help="How long it is good. [default: for ever]", min=0.0, max=MOST_DAYS)
+    ] = None,
 ) -> None:
     """Make an API key and print it: it is not stored and cannot be shown again."""
     from service.storage.keys import Keys
@@ -467,6 +473,8 @@ def _plain_failures() -> Iterator[None]:
         yield
     except SQLAlchemyError as exc:
         raise _failure(f"The database cannot be used: {_reason(exc)}") from exc
+    except UnicodeEncodeError as exc:
+        raise _failure(f"{ascii(exc.object)[:80]} is no text: its bytes are no UTF-8.", WRONG_USE) from exc
     except (CamindError, ModelFolderError, SettingsError, OSError) as exc:
         cause = exc.__cause__ if isinstance(exc, CamindError) and exc.status >= 500 else None
         raise _failure(f"{exc}\n{_reason(cause)}" if cause else str(exc)) from exc

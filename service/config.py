@@ -8,8 +8,10 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
+from sqlalchemy import URL, make_url
+from sqlalchemy.exc import ArgumentError
 
 from service.cores import available_cores
 
@@ -22,6 +24,16 @@ DATABASE_SCHEMES = ("sqlite", "postgresql+psycopg")
 
 class SettingsError(ValueError):
     """A setting that cannot be served with; the message names the variable and its bound."""
+
+
+def _expanded(path: Path) -> Path:
+    try:
+        return path.expanduser()
+    except RuntimeError as exc:
+        raise ValueError(f"there is no such home: {exc}") from exc
+
+
+Folder = Annotated[Path, AfterValidator(_expanded)]
 
 
 def default_data_dir() -> Path:
@@ -40,13 +52,13 @@ class Settings(BaseSettings):
 
     model_config = SettingsConfigDict(env_prefix=ENV_PREFIX, frozen=True, extra="forbid", env_ignore_empty=True)
 
-    data_dir: Annotated[Path, Field(description="Folder of the database and of the service's files")] = Field(
+    data_dir: Annotated[Folder, Field(description="Folder of the database and of the service's files")] = Field(
         default_factory=default_data_dir
     )
     database_url: Annotated[
         str, Field(description="SQLite or PostgreSQL (postgresql+psycopg://); empty: a file in data_dir")
     ] = ""
-    model_dir: Annotated[Path, Field(description="Model folder to serve; default: the shipped model")] = SHIPPED_MODEL
+    model_dir: Annotated[Folder, Field(description="Model folder to serve; default: the shipped model")] = SHIPPED_MODEL
     precision: Annotated[
         Literal["float32", "int8"], Field(description="Numbers the graphs compute with; int8: model_dir/int8")
     ] = "float32"
@@ -122,6 +134,17 @@ class Settings(BaseSettings):
         scheme = self.database_url.partition(":")[0]
         if self.database_url and scheme not in DATABASE_SCHEMES:
             raise ValueError(f"{ENV_PREFIX}DATABASE_URL must begin with one of {', '.join(DATABASE_SCHEMES)}")
+        try:
+            url = self.effective_database_url
+            url.get_dialect()().create_connect_args(url)
+        except (ArgumentError, ValueError) as exc:
+            # what was read wrongly may be a part of the password
+            raise ValueError(
+                f"{ENV_PREFIX}DATABASE_URL cannot be read: write sqlite:////folder/file or "
+                "postgresql+psycopg://user:password@host:port/name, other signs than letters and digits as %XX"
+            ) from exc
+        if self.is_database_embedded and (url.database in (None, "", ":memory:") or "uri" in url.query):
+            raise ValueError(f"{ENV_PREFIX}DATABASE_URL names no file: write sqlite:////folder/file")
         return self
 
     @model_validator(mode="after")
@@ -150,19 +173,21 @@ class Settings(BaseSettings):
         return self.model_dir / INT8 if self.precision == INT8 else self.model_dir
 
     @property
-    def effective_database_url(self) -> str:
+    def effective_database_url(self) -> URL:
         """The database's URL, the default file in the data folder filled in."""
-        return self.database_url or f"sqlite:///{self.data_dir.expanduser().resolve() / DATABASE_FILE}"
+        if self.database_url:
+            return make_url(self.database_url)
+        return URL.create("sqlite", database=str(self.data_dir.resolve() / DATABASE_FILE))
 
     @property
     def spool_dir(self) -> Path:
         """Where photographs lie until their calibration ends."""
-        return self.data_dir.expanduser().resolve() / "calibrations"
+        return self.data_dir.resolve() / "calibrations"
 
     @property
     def is_database_embedded(self) -> bool:
         """Whether the database is ours alone, and ``camind serve`` may migrate it."""
-        return self.effective_database_url.startswith("sqlite")
+        return self.effective_database_url.get_backend_name() == "sqlite"
 
     @property
     def wants_keys(self) -> bool:

@@ -5,26 +5,34 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import cast
+from uuid import uuid4
 
 import h11
+import structlog
 import uvicorn
 from fastapi import FastAPI
+from starlette.datastructures import Headers
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from service.api.problems import PROBLEM_TYPE, problem
 from service.config import Settings
 from service.errors import BadRequest, CamindError, ReceiveTimeout
 from service.memory import keep_freed_memory
+from service.middleware import REQUEST_ID, SANE_REQUEST_ID
 
 GRACE_S = 1.0
 BACKLOG = 2048
 MOST_HEADER_BYTES = 65_536
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
+UNANSWERED = (h11.IDLE, h11.SEND_RESPONSE)
 SIGNALLED = 128  # what a shell adds to the signal that ended a process
+
+
+log = structlog.stdlib.get_logger("camind.request")
 
 
 class PortTakenError(OSError):
@@ -137,17 +145,27 @@ class DeadlineProtocol(H11Protocol):
     def _refuse(self, error: CamindError) -> None:
         """Answer and close; what still comes is thrown away for a moment, for a reset would take the answer along."""
         self.count_problem(error.code)
+        request = self.scope if self.conn.our_state is h11.SEND_RESPONSE else None
+        request_id = _request_id(request["headers"] if request else ())
+        is_answered = self.conn.our_state not in UNANSWERED
+        log.info("refused", request_id=request_id, status=None if is_answered else error.status, problem=error.code)
         body = problem(error).model_dump_json(exclude_none=True).encode()
         headers = [
             ("Content-Type", PROBLEM_TYPE),
             ("Content-Length", str(len(body))),
             ("Connection", "close"),
+            (REQUEST_ID, request_id),
         ]
         response = h11.Response(status_code=error.status, headers=headers, reason=error.title.encode())
-        if self.conn.our_state is h11.IDLE:
-            for event in (response, h11.Data(data=body), h11.EndOfMessage()):
+        if not is_answered:
+            data = h11.Data(data=b"" if request and request["method"] == "HEAD" else body)
+            for event in (response, data, h11.EndOfMessage()):
                 self.transport.write(self.conn.send(event) or b"")
         self._is_refused = True
+        if self.cycle is not None:
+            # to the app, the client is gone
+            self.cycle.disconnected = True
+            self.cycle.message_event.set()
         self._stop_clock()
         self._clock = self.loop.call_later(GRACE_S, self.transport.close)
         self.transport.write_eof()
@@ -184,6 +202,12 @@ class StoppingServer(uvicorn.Server):
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         await asyncio.sleep(self._drain_s)
         await super().shutdown(sockets)
+
+
+def _request_id(headers: Iterable[tuple[bytes, bytes]]) -> str:
+    """The id that a request came with, or a new one."""
+    given = Headers(raw=list(headers)).get(REQUEST_ID, "")
+    return given if SANE_REQUEST_ID.fullmatch(given) else uuid4().hex
 
 
 def bind(host: str, port: int) -> socket.socket:

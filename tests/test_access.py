@@ -77,6 +77,7 @@ def operations(app: FastAPI) -> Iterator[tuple[str, str, list[str]]]:
         ({"Sec-Fetch-Site": "same-site", "Origin": "http://testserver:9"}, True),
         ({"Origin": "http://elsewhere.example"}, True),
         ({"Origin": "null"}, True),
+        ({"Origin": "http://["}, True),
         ({"Sec-Fetch-Site": "same-origin", "Origin": "http://behind-a-proxy.example"}, False),
         ({"Sec-Fetch-Site": "none"}, False),
         ({"Origin": "http://testserver"}, False),

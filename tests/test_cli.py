@@ -102,6 +102,28 @@ def test_why_a_server_is_not_reached_is_said_without_its_password(tmp_path: Path
     assert "hunter2" not in done.stderr
 
 
+@pytest.mark.parametrize("url", ["postgresql+psycopg://u:p@h:abc/db", "sqlite://", "sqlite:/x"])
+def test_a_url_of_no_database_is_said(tmp_path: Path, url: str) -> None:
+    done = camind(tmp_path, "backup", str(tmp_path / "copy"), CAMIND_DATABASE_URL=url)
+    assert (done.returncode, done.stderr.count("Traceback")) == (2, 0)
+    assert done.stderr.startswith("CAMIND_DATABASE_URL ")
+
+
+@pytest.mark.parametrize("days", ["9999999", "nan", "-1"])
+@pytest.mark.usefixtures("bench")
+def test_a_key_that_outlives_the_calendar_is_not_made(days: str) -> None:
+    refused = at_once("keys", "create", "k", "--days", days)
+    assert (refused.exit_code, "--days" in refused.stderr) == (2, True)
+    assert at_once("keys", "list").stdout == ""
+
+
+@pytest.mark.parametrize("arguments", [("cameras", "list", "--owner"), ("keys", "revoke")])
+@pytest.mark.usefixtures("bench")
+def test_what_is_no_utf_8_is_said(arguments: tuple[str, ...]) -> None:
+    refused = at_once(*arguments, os.fsdecode(b"\xff"))
+    assert (refused.exit_code, "no UTF-8" in refused.stderr) == (2, True)
+
+
 def test_other_packages_commands_stand_beside_ours(monkeypatch: pytest.MonkeyPatch) -> None:
     entry_point = EntryPoint("extra", "tests.test_cli:EXTRA", cli.GROUP)
     monkeypatch.setattr(cli.app, "registered_commands", list(cli.app.registered_commands))
@@ -199,6 +221,7 @@ def at_once(*arguments: str, said: str = "") -> Result:
         ("x", 2, "This is no JSON: "),
         ("[]", 2, "valid dictionary"),
         (json.dumps({**BENCH, "focus_distance_m": -2}), 2, "focus_distance_m: "),
+        (json.dumps({**BENCH, "name": "half", "description": "\ud800"}), 2, "description: "),
         (json.dumps({**BENCH, "k_cam_px": None}), 1, "exactly one of k_cam_px and lens"),
         (json.dumps(BENCH), 1, "exists already"),
     ],

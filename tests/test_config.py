@@ -7,6 +7,7 @@ from pydantic import ValidationError
 
 from service.config import SHIPPED_MODEL, Settings, SettingsError, load_settings
 from service.cores import available_cores
+from service.storage.engine import open_engine
 
 
 @pytest.fixture(autouse=True)
@@ -23,7 +24,7 @@ def test_the_defaults_serve_this_machine_only(tmp_path: Path) -> None:
     assert settings.is_loopback
     assert settings.port == 8000
     assert settings.model_dir == SHIPPED_MODEL
-    assert settings.effective_database_url == f"sqlite:///{tmp_path / 'camind' / 'camind.sqlite3'}"
+    assert str(settings.effective_database_url) == f"sqlite:///{tmp_path / 'camind' / 'camind.sqlite3'}"
     assert settings.worker_slots * settings.threads_per_worker <= available_cores()
 
 
@@ -34,7 +35,26 @@ def test_variables_and_then_the_command_line_win(monkeypatch: pytest.MonkeyPatch
     settings = load_settings(port=9001, host=None)
     assert settings.port == 9001
     assert not settings.is_loopback
-    assert settings.effective_database_url.endswith("own/camind.sqlite3")
+    assert settings.effective_database_url.database == str(tmp_path / "own" / "camind.sqlite3")
+
+
+@pytest.mark.parametrize("name", ["what?", "a%41", "a b#c;d&e=f", "große"])
+def test_any_folder_holds_the_database(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str) -> None:
+    monkeypatch.setenv("CAMIND_DATA_DIR", str(tmp_path / name))
+    engine = open_engine(load_settings().effective_database_url)
+    engine.connect().close()
+    engine.dispose()
+    assert [path.name for path in (tmp_path / name).iterdir()] == ["camind.sqlite3"]
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_folders_may_begin_with_the_user_s_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("CAMIND_DATA_DIR", "~/data")
+    monkeypatch.setenv("CAMIND_MODEL_DIR", "~/model")
+    settings = load_settings()
+    assert settings.effective_database_url.database == str(tmp_path / "data" / "camind.sqlite3")
+    assert settings.served_model_dir == tmp_path / "model"
 
 
 def test_an_empty_variable_counts_as_none(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -65,6 +85,14 @@ def test_an_empty_variable_counts_as_none(monkeypatch: pytest.MonkeyPatch) -> No
         ("DATABASE_URL", "mysql://localhost/camind"),
         ("DATABASE_URL", "postgresql://localhost/camind"),
         ("DATABASE_URL", "nonsense"),
+        ("DATABASE_URL", "postgresql+psycopg://u:p@h:abc/db"),
+        ("DATABASE_URL", "sqlite:/x"),
+        ("DATABASE_URL", "sqlite://"),
+        ("DATABASE_URL", "sqlite:///:memory:"),
+        ("DATABASE_URL", "sqlite:///file::memory:?uri=true"),
+        ("DATABASE_URL", "sqlite:////x?timeout=abc"),
+        ("DATA_DIR", "~nobody-has-this-name/x"),
+        ("MODEL_DIR", "~nobody-has-this-name/x"),
         ("WORKERS", "-1"),
     ],
 )
@@ -72,6 +100,13 @@ def test_a_wrong_value_is_named(monkeypatch: pytest.MonkeyPatch, name: str, valu
     monkeypatch.setenv(f"CAMIND_{name}", value)
     with pytest.raises(SettingsError, match=f"CAMIND_{name}"):
         load_settings()
+
+
+def test_a_wrong_url_s_password_is_not_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CAMIND_DATABASE_URL", "postgresql+psycopg://u:x@y:hunter@h/db")
+    with pytest.raises(SettingsError, match="as %XX") as refused:
+        load_settings()
+    assert "hunter" not in str(refused.value)
 
 
 def test_more_threads_than_cores_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -63,6 +63,7 @@ def test_headers_that_never_end_are_cut_off(server: Server) -> None:
         status, headers, body = read_to_end(connection)
     assert status == 408
     assert headers["content-type"] == "application/problem+json"
+    assert headers["x-request-id"]
     assert json.loads(body)["type"] == "urn:camind:problem:receive-timeout"
     assert time.monotonic() - started < RECEIVE_DEADLINE_S + 3
 
@@ -95,6 +96,34 @@ def test_what_is_no_http_gets_a_problem(server: Server, raw: bytes) -> None:
     assert status == 400
     assert headers["content-type"] == "application/problem+json"
     assert json.loads(body)["status"] == 400
+
+
+def events_of(server: Server, request_id: str) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in server.log.splitlines() if request_id in line]
+
+
+def test_what_is_no_http_is_in_the_log_under_its_id(server: Server) -> None:
+    with server.connect() as connection:
+        connection.sendall(b"NONSENSE\r\n\r\n")
+        _, headers, _ = read_to_end(connection)
+    (event,) = server.poll(lambda: events_of(server, headers["x-request-id"]))
+    assert (event["event"], event["status"], event["problem"]) == ("refused", 400, "malformed-request")
+
+
+@pytest.mark.parametrize(("method", "pause_s"), [("POST", 0.1), ("POST", 0), ("HEAD", 0)])
+def test_a_body_that_is_no_http_gets_a_problem(server: Server, method: str, pause_s: float) -> None:
+    request_id = f"bad-chunk-{method.lower()}-{pause_s}"
+    head = f"{method} /cameras HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nX-Request-Id: {request_id}"
+    pieces = [head.encode() + b"\r\nTransfer-Encoding: chunked\r\n\r\n", b"zz\r\n{}\r\n"]
+    with server.connect() as connection:
+        for piece in pieces if pause_s else [b"".join(pieces)]:
+            connection.sendall(piece)
+            time.sleep(pause_s)
+        status, headers, body = read_to_end(connection)
+    assert (status, headers["x-request-id"], bool(body)) == (400, request_id, method != "HEAD")
+    events = server.poll(lambda: events_of(server, request_id))
+    assert events[0]["event"] == "refused"
+    assert "Traceback" not in server.log
 
 
 def test_a_body_that_is_too_large_is_answered_though_it_was_sent_whole(server: Server) -> None:

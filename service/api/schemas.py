@@ -13,7 +13,7 @@ from service.storage.cameras import DEFAULT_K_R, NAME_PATTERN, CameraDraft, Came
 
 DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 PLAIN_TEXT = r"^[^\x00-\x08\x0b\x0c\x0e-\x1f\x7f]*$"
-NO_CONTROLS = "a description has no control characters but tabs and line breaks"
+NO_CONTROLS = "a description has no control characters but tabs and line breaks, and no half characters (surrogates)"
 
 A_NAME = "a name has letters, digits, dots, dashes and underscores, 64 at most, and begins with a letter or digit"
 

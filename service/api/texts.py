@@ -10,11 +10,13 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
 MOST_LETTERS = 100
+# JSON can escape them, and no database stores them; not in the patterns, for not all programs that read those know them
+HALF_CHARACTER = re.compile(r"[\ud800-\udfff]")
 
 
 @dataclass(frozen=True, slots=True)
 class Worded:
-    """Annotates a text of a pattern: the document has the pattern, a fault the words."""
+    """Annotates a text of a pattern, without half characters: the document has the pattern, a fault the words."""
 
     pattern: str
     words: str
@@ -26,7 +28,7 @@ class Worded:
         return {**handler(schema), "pattern": self.pattern}
 
     def _require(self, text: str) -> str:
-        if not re.fullmatch(self.pattern, text):
+        if not re.fullmatch(self.pattern, text) or HALF_CHARACTER.search(text):
             raise ValueError(self.words)
         return text
 

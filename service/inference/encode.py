@@ -208,7 +208,7 @@ def _is_met(answer: DepthMap) -> NDArray[np.bool_]:
     ahead = np.column_stack([*_rays(answer, u, v), np.ones(len(u))])
     back = cv2.projectPoints(ahead, np.zeros(3), np.zeros(3), camera_matrix(answer), distortion)[0][:, 0]
     is_met = (np.hypot(*(back - np.stack([u, v], 1)).T) <= MOST_OFF_PX).reshape(len(down), len(across))
-    return is_met[:-1, :-1] & is_met[1:, :-1] & is_met[:-1, 1:] & is_met[1:, 1:]
+    return np.asarray(is_met[:-1, :-1] & is_met[1:, :-1] & is_met[:-1, 1:] & is_met[1:, 1:])
 
 
 def spread_of(answer: DepthMap) -> Spread:

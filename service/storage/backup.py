@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,15 @@ from sqlalchemy import URL, Select, column, func, make_url, select, table
 
 from service.errors import NotReady
 from service.storage import schema
+from service.storage.calibrations import Calibrations
 from service.storage.disk import sync_folder, try_lock, write_through
 from service.storage.engine import SQLITE_DAMAGED, open_engine
 
 BUSY_TIMEOUT_S = 30.0
 # what SQLite keeps beside a database; of another database they would be played into it
 SIDE_FILES = ("-journal", "-wal", "-shm")
+# what only writing can end with
+UNWRITTEN = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_WRITE, sqlite3.SQLITE_IOERR_FSYNC, sqlite3.SQLITE_IOERR_TRUNCATE)
 
 
 class DatabaseFileError(OSError):
@@ -44,7 +47,7 @@ class Contents:
         return f"{rows or 'no tables'}; schema {self.revision}"
 
 
-def database_file(database_url: str) -> Path | None:
+def database_file(database_url: str | URL) -> Path | None:
     """The file of an SQLite database, links followed; None for one on a server or in memory."""
     url = make_url(database_url)
     is_file = url.get_backend_name() == "sqlite" and url.database not in (None, "", ":memory:")
@@ -52,7 +55,7 @@ def database_file(database_url: str) -> Path | None:
 
 
 @contextmanager
-def using(database_url: str) -> Iterator[None]:
+def using(database_url: str | URL) -> Iterator[None]:
     """Nobody restores the database meanwhile. Raises ``NotReady`` where somebody does."""
     file = database_file(database_url)
     if file is None:
@@ -87,14 +90,15 @@ def backup(database: Path, target: Path, *, is_forced: bool = False) -> Contents
     if target.exists() and not is_forced:
         raise DatabaseFileError(f"{target} is there already: choose another name, or overwrite it with --force.")
     with _draft_beside(target) as draft:
-        contents = _copied(database, draft)
+        contents = _copied(database, draft, target)
         _put_in_place(draft, target)
     return contents
 
 
-def restore(source: Path, database: Path) -> tuple[Contents, Path | None]:
+def restore(source: Path, database: Path, spool: str | None = None) -> tuple[Contents, Path | None]:
     """Put a backup in the database's place, at the newest schema; what it holds, and where the replaced one is kept.
 
+    Calibrations that have not ended fail, but for those whose photographs are in the ``spool`` with this id.
     Raises ``DatabaseFileError`` where the backup is damaged, is none of this service's or of a later version's, and
     while the database is used.
     """
@@ -103,8 +107,8 @@ def restore(source: Path, database: Path) -> tuple[Contents, Path | None]:
     if database.exists() and source.samefile(database):
         raise DatabaseFileError(f"{source} is the database itself: name a backup.")
     with _replacing(database), _draft_beside(database) as draft:
-        _require_known(_copied(source, draft), source)
-        _migrate(draft)
+        _require_known(_copied(source, draft, database), source)
+        _make_ready(draft, spool)
         contents = _contents(draft)
         kept = _keep(database)
         if kept is not None:
@@ -168,12 +172,17 @@ def _opened(file: Path) -> Iterator[sqlite3.Connection]:
         raise DatabaseFileError(f"{file} cannot be used by SQLite: {exc}.") from exc
 
 
-def _copied(source: Path, draft: Path) -> Contents:
-    """Copy a database, and check the copy: what is damaged is damaged in both."""
-    with _opened(draft) as copy, _opened(source) as connection:
-        connection.backup(copy)
-        # a write-ahead log would be a second file
-        copy.execute("PRAGMA journal_mode = DELETE")
+def _copied(source: Path, draft: Path, target: Path) -> Contents:
+    """Copy a database, and check the copy, which is to become the target: what is damaged is damaged in both."""
+    with _opened(source) as connection, _opened(draft) as copy:
+        try:
+            connection.backup(copy)
+            # a write-ahead log would be a second file
+            copy.execute("PRAGMA journal_mode = DELETE")
+        except sqlite3.Error as exc:
+            if getattr(exc, "sqlite_errorcode", None) in UNWRITTEN:
+                raise DatabaseFileError(f"{target} cannot be written: {exc}.") from exc
+            raise DatabaseFileError(f"{source} cannot be copied: {exc}.") from exc
     damage = _damage(draft)
     if damage is not None:
         raise DatabaseFileError(f"{source} is damaged ({damage}): nothing was changed.")
@@ -221,10 +230,12 @@ def _require_known(contents: Contents, source: Path) -> None:
         )
 
 
-def _migrate(file: Path) -> None:
+def _make_ready(file: Path, spool: str | None) -> None:
     engine = open_engine(URL.create("sqlite", database=str(file)))
     try:
         schema.upgrade(engine)
+        # other folders' photographs do not come back with a backup
+        Calibrations(engine).give_up(spool or "", timedelta(0))
     finally:
         engine.dispose()
 

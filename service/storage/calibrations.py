@@ -257,15 +257,15 @@ class Calibrations:
         with writing(self._engine) as session:
             session.connection().execute(again)
 
-    def give_up(self, spool: str) -> None:
-        """What other spools left behind long ago fails."""
+    def give_up(self, spool: str, silent_for: timedelta = ABANDONED_AFTER) -> None:
+        """What other spools have left alone for so long fails."""
         now = datetime.now(UTC)
         given_up = (
             update(CalibrationRow)
             .where(
                 col(CalibrationRow.spool) != spool,
                 col(CalibrationRow.state).in_(LIVE),
-                col(CalibrationRow.updated_at) < now - ABANDONED_AFTER,
+                col(CalibrationRow.updated_at) <= now - silent_for,
             )
             .values(
                 state="failed",

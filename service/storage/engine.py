@@ -20,18 +20,29 @@ FIRST_SAFE_WAL = (3, 51, 3)
 IS_WRITE = "camind_is_write"
 SQLITE_DAMAGED = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 POSTGRESQL_DISK_FULL = "53100"
+# a lock, or an answer, that took too long
+POSTGRESQL_BUSY = ("55P03", "57014")
 
 
 def open_engine(database_url: str | URL) -> Engine:
     """An engine for the URL; the folder of an SQLite file is made. Nothing is connected yet."""
     url = make_url(database_url)
     if url.get_backend_name() != "sqlite":
-        return create_engine(url, pool_timeout=POOL_TIMEOUT_S, pool_pre_ping=True)
+        return _open_postgresql(url)
     if url.database and url.database != ":memory:":
         Path(url.database).parent.mkdir(parents=True, exist_ok=True)
     engine = create_engine(url, pool_timeout=POOL_TIMEOUT_S)
     event.listen(engine, "connect", _prepare_sqlite)
     event.listen(engine, "begin", _begin_sqlite)
+    return engine
+
+
+def _open_postgresql(url: URL) -> Engine:
+    from service.storage import postgresql  # which needs an extra
+
+    arguments = postgresql.connect_args(url)
+    engine = create_engine(url, pool_timeout=POOL_TIMEOUT_S, pool_pre_ping=True, connect_args=arguments)
+    postgresql.bound(engine)
     return engine
 
 
@@ -56,6 +67,19 @@ def writing(engine: Engine) -> Iterator[Session]:
     """
     with _translated(), Session(engine.execution_options(**{IS_WRITE: True})) as session, session.begin():
         yield session
+
+
+@contextmanager
+def unhurried(connection: Connection) -> Iterator[None]:
+    """A transaction that may take as long as it needs, as a migration does."""
+    if connection.dialect.name == "sqlite":
+        with connection.begin():
+            yield
+        return
+    from service.storage import postgresql
+
+    with postgresql.unhurried(connection):
+        yield
 
 
 def require_writable(engine: Engine) -> None:
@@ -101,13 +125,13 @@ def _translated() -> Iterator[None]:
 
 
 def _unavailable(error: DatabaseError) -> CamindError:
-    primary = getattr(error.orig, "sqlite_errorcode", 0) & 0xFF
-    if primary == sqlite3.SQLITE_FULL or getattr(error.orig, "sqlstate", None) == POSTGRESQL_DISK_FULL:
+    primary, state = getattr(error.orig, "sqlite_errorcode", 0) & 0xFF, getattr(error.orig, "sqlstate", None)
+    if primary == sqlite3.SQLITE_FULL or state == POSTGRESQL_DISK_FULL:
         return InsufficientStorage("The database's disk is full and nothing was stored: try again when there is room.")
     if primary in SQLITE_DAMAGED:
         return NotReady("The database is damaged: stop the service, and `camind restore` a backup.")
     if primary == sqlite3.SQLITE_READONLY:
         return NotReady("The database takes no writes.")
-    if "locked" in str(error.orig):
+    if "locked" in str(error.orig) or state in POSTGRESQL_BUSY:
         return Busy("The database is busy: try again in a second.")
     return NotReady("The database cannot be used: the service's log says why.")

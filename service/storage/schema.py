@@ -12,7 +12,7 @@ from sqlalchemy import Connection, Engine
 
 import migrations
 from service.errors import NotReady
-from service.storage.engine import IS_WRITE, reading
+from service.storage.engine import IS_WRITE, reading, unhurried
 
 BASE = "base"
 HEAD = "head"
@@ -84,7 +84,7 @@ def _migrating(engine: Engine) -> Iterator[Connection]:
             # transactions only
             _run_outside_transaction(connection, "PRAGMA foreign_keys = OFF")
         try:
-            with connection.begin():
+            with unhurried(connection):
                 if engine.dialect.name == "postgresql":
                     connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({LOCK})")
                 yield connection

@@ -107,6 +107,12 @@ def picture_file(number: int) -> str:
     return f"{number:04d}"
 
 
+def known_id(folder: Path) -> str | None:
+    """The id of the spool in a folder; None where there is none yet, and none is made."""
+    path = folder / ID_FILE
+    return path.read_text() if path.exists() else None
+
+
 def _id_in(folder: Path) -> str:
     """The folder's id; the first process that comes makes it, whole or not at all."""
     path = folder / ID_FILE

@@ -304,6 +304,12 @@ def test_a_wrong_field_is_pointed_at(
     assert answer.json()["errors"][0]["pointer"] == pointer
 
 
+def test_half_a_character_is_no_description(client: TestClient, phone: dict[str, Any]) -> None:
+    body = json.dumps({**phone, "description": "a\ud800b"})
+    answer = client.post("/cameras", content=body, headers={"Content-Type": "application/json"})
+    assert (answer.status_code, answer.json()["errors"][0]["pointer"]) == (422, "#/description")
+
+
 @pytest.mark.parametrize("missing", ["name", "image_width_px", "image_height_px", "focus_distance_m"])
 def test_a_missing_field_is_pointed_at(client: TestClient, phone: dict[str, Any], missing: str) -> None:
     del phone[missing]

@@ -5,6 +5,7 @@ import struct
 import time
 from collections.abc import Callable
 from io import BytesIO
+from typing import Any
 
 import numpy as np
 import pytest
@@ -178,7 +179,7 @@ def test_a_tiff_of_floating_point_numbers_is_refused() -> None:
         ({"photometric": "miniswhite"}, "0 is white"),
     ],
 )
-def test_a_tiff_of_16_bits_that_the_decoder_takes_for_another_is_refused(form: dict[str, str], said: str) -> None:
+def test_a_tiff_of_16_bits_that_the_decoder_takes_for_another_is_refused(form: dict[str, Any], said: str) -> None:
     colours = np.linspace(0, 65535, 24 * 32 * 3).astype(np.uint16).reshape(24, 32, 3)
     pixels = np.moveaxis(colours, 2, 0) if "planarconfig" in form else colours[..., 0]
     out = BytesIO()

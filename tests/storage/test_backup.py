@@ -16,6 +16,7 @@ from service.errors import NotReady
 from service.optics.camera import Camera
 from service.storage import schema
 from service.storage.backup import DatabaseFileError, backup, database_file, require_sound, restore, using
+from service.storage.calibrations import CalibrationDraft, Calibrations
 from service.storage.cameras import CameraDraft, Cameras
 from service.storage.engine import open_engine
 
@@ -152,6 +153,19 @@ def test_a_backup_overwrites_only_by_force(database: Path, tmp_path: Path) -> No
         backup(database, database, is_forced=True)
 
 
+def test_a_target_without_room_is_named(database: Path, tmp_path: Path) -> None:
+    limited = (
+        "import resource, sys; from pathlib import Path; from service.storage.backup import backup;"
+        f"resource.setrlimit(resource.RLIMIT_FSIZE, ({PAGE_BYTES}, {PAGE_BYTES})); backup(*map(Path, sys.argv[1:]))"
+    )
+    target = tmp_path / "copy.sqlite3"
+    done = subprocess.run(
+        [sys.executable, "-c", limited, database, target], check=False, capture_output=True, text=True
+    )
+    assert f"DatabaseFileError: {target} cannot be written" in done.stderr
+    assert files_of(tmp_path) == {"data"}
+
+
 def test_nothing_is_not_backed_up(tmp_path: Path) -> None:
     with pytest.raises(DatabaseFileError, match="no database"):
         backup(tmp_path / "absent.sqlite3", tmp_path / "copy.sqlite3")
@@ -213,6 +227,20 @@ def test_an_older_backup_comes_to_the_newest_schema(database: Path, copy: Path) 
     assert contents.revision == schema.head_revision()
     assert contents.rows["calibrations"] == 0
     assert names_in(database) == ["new"]
+
+
+def test_calibrations_whose_photographs_are_elsewhere_fail(database: Path, copy: Path) -> None:
+    engine = open_engine(f"sqlite:///{copy}")
+    for id_, spool in (("a" * 32, "here"), ("b" * 32, "elsewhere")):
+        Calibrations(engine).add(CalibrationDraft(id_, spool, "bench", {}, ()))
+    engine.dispose()
+    for known, states in (("here", ["failed", "queued"]), (None, ["failed", "failed"])):
+        restore(copy, database, known)
+        engine = open_engine(f"sqlite:///{database}")
+        found = Calibrations(engine).page(2)[0]
+        engine.dispose()
+        assert [each.state for each in found] == states
+        assert "send them again" in str(found[0].problem)
 
 
 def test_a_damaged_database_is_replaced_and_kept(database: Path, copy: Path) -> None:

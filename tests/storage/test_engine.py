@@ -1,14 +1,20 @@
 """Commits are durable, references hold, and what the database cannot do is told apart."""
 
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 from sqlalchemy import Engine
-from sqlalchemy.exc import IntegrityError
+from sqlalchemy.exc import DatabaseError, IntegrityError
 
 from service.errors import Busy, NotReady
-from service.storage import schema
+from service.storage import postgresql, schema
+from service.storage.cameras import Cameras
 from service.storage.engine import journal_mode, open_engine, reading, require_writable, writing
 from service.storage.tables import CameraRevisionRow
 
@@ -84,3 +90,66 @@ def test_no_free_connection_is_busy(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_a_migrated_database_is_ready(engine: Engine) -> None:
     schema.require_head(engine)
     require_writable(engine)
+
+
+@pytest.fixture
+def hurried(postgres_url: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Engine]:
+    """An engine on PostgreSQL that waits for nothing for long."""
+    monkeypatch.setattr(postgresql, "LOCK_TIMEOUT_MS", 200)
+    monkeypatch.setattr(postgresql, "STATEMENT_TIMEOUT_MS", 400)
+    monkeypatch.setattr(postgresql, "ANSWER_TIMEOUT_S", 0.8)
+    engine = open_engine(postgres_url)
+    yield engine
+    engine.dispose()
+
+
+def test_a_table_that_stays_locked_is_busy(hurried: Engine) -> None:
+    schema.upgrade(hurried)
+    with hurried.begin() as connection:
+        connection.exec_driver_sql("LOCK TABLE cameras IN ACCESS EXCLUSIVE MODE")
+        with pytest.raises(Busy):
+            Cameras(hurried).page(1)
+        with pytest.raises(Busy):
+            require_writable(hurried)
+    assert Cameras(hurried).page(1) == ([], False)
+
+
+def test_a_statement_that_takes_too_long_is_busy(hurried: Engine) -> None:
+    with pytest.raises(Busy), reading(hurried) as session:
+        session.connection().exec_driver_sql("SELECT pg_sleep(30)")
+
+
+def test_a_server_that_stands_still_is_not_ready(hurried: Engine) -> None:
+    with reading(hurried) as session:
+        backend = session.connection().exec_driver_sql("SELECT pg_backend_pid()").scalar_one()
+        try:
+            os.kill(backend, signal.SIGSTOP)
+            with pytest.raises(DatabaseError, match="timeout"):
+                session.connection().exec_driver_sql("SELECT 1")
+        finally:
+            os.kill(backend, signal.SIGCONT)
+    with reading(hurried) as session:
+        assert session.connection().exec_driver_sql("SELECT pg_backend_pid()").scalar_one() != backend
+
+
+def test_a_migration_waits_as_long_as_it_takes(hurried: Engine) -> None:
+    other = hurried.connect()
+    other.exec_driver_sql(f"SELECT pg_advisory_lock({schema.LOCK})")
+    started_s = time.monotonic()
+    releasing = threading.Timer(2, other.exec_driver_sql, [f"SELECT pg_advisory_unlock({schema.LOCK})"])
+    releasing.start()
+    schema.upgrade(hurried)
+    assert time.monotonic() - started_s > 1.5
+    releasing.join()
+    other.close()
+    with pytest.raises(Busy), reading(hurried) as session:
+        session.connection().exec_driver_sql("SELECT pg_sleep(30)")
+
+
+def test_a_url_s_own_parameters_win(postgres_url: str) -> None:
+    engine = open_engine(f"{postgres_url}&connect_timeout=9&options=-c%20lock_timeout%3D77")
+    assert "connect_timeout" not in postgresql.connect_args(engine.url)
+    with engine.connect() as connection:
+        assert connection.exec_driver_sql("SHOW lock_timeout").scalar() == "77ms"
+        assert connection.exec_driver_sql("SHOW statement_timeout").scalar() == "8s"
+    engine.dispose()
