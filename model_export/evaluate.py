@@ -393,13 +393,14 @@ def _sides(case: Case, told: DepthMap) -> Sides:
     focus_m = case.camera.focus_distance_m
     with np.errstate(invalid="ignore"):
         out = np.abs(focus_m / case.truth_m - 1) > CLEARLY_OUT
-        asked = out & np.isfinite(told.depth_m)
-        truth, depth, alt = case.truth_m[asked], told.depth_m[asked], told.depth_alt_m[asked]
-        reach = 2 * told.sigma_m[asked] / depth
+        truth, depth, alt = case.truth_m[out], told.depth_m[out], told.depth_alt_m[out]
+        reach = 2 * told.sigma_m[out] / depth
         either = (np.abs(truth / depth - 1) <= reach) | (np.abs(truth / alt - 1) <= reach)
-    if not asked.any():
+    if not out.any():
         return Sides(0.0, 0.0, 0)
-    return Sides(float(((depth < focus_m) == (truth < focus_m)).mean()), float(either.mean()), int(asked.sum()))
+    # what has no answer is on no side
+    right = ((depth < focus_m) == (truth < focus_m)) & np.isfinite(depth)
+    return Sides(float(right.mean()), float(either.mean()), int(out.sum()))
 
 
 def summarise(name: str, mode: str, outcomes: Sequence[Outcome]) -> Summary:

@@ -95,7 +95,8 @@ async def _from_form(request: Request, max_bytes: int, take: Callable[[int], Non
     try:
         form = await parser.parse()
     except (MultiPartException, KeyError, ValueError) as exc:  # ValueError: of a charset that decodes nothing
-        raise BadRequest(f"The form cannot be read ({exc}): send one file in the field '{FIELD}'.") from exc
+        detail = f"The form cannot be read ({exc}): send one file in the field '{FIELD}'."
+        raise BadRequest(detail, errors=(FieldProblem(f"#/{FIELD}", detail),)) from exc
     try:
         file = form.get(FIELD)
         if not isinstance(file, UploadFile) or len(form.multi_items()) != 1:

@@ -243,8 +243,8 @@ def pixel_at(u: float, v: float, part: Part, asked_in: str = "at") -> tuple[int,
     """
     row, column = math.floor(v + 0.5) - part.top, math.floor(u + 0.5) - part.left
     if not (0 <= row < part.height_px and 0 <= column < part.width_px):
-        of = f" from ({part.left}, {part.top})" if part.left or part.top else ""
-        detail = f"({u:g}, {v:g}) lies outside the upright photograph of {part.width_px}x{part.height_px} pixels{of}."
+        asked = f"({part.left}, {part.top}) to ({part.right}, {part.bottom})"
+        detail = f"({u:g}, {v:g}) lies outside what is asked for of the upright photograph, {asked}."
         raise BadRequest(detail, errors=(FieldProblem(asked_in, detail),))
     return row, column
 

@@ -192,5 +192,5 @@ def test_a_point_is_read_at_the_pixel_whose_area_holds_it(answer: DepthMap) -> N
 
 @pytest.mark.parametrize(("u", "v"), [(40, 0), (0, 30), (-1, 0), (39.5, 0), (-0.51, 0)])
 def test_a_point_outside_is_refused(answer: DepthMap, u: float, v: float) -> None:
-    with pytest.raises(BadRequest, match="40x30"):
+    with pytest.raises(BadRequest, match=r"\(0, 0\) to \(40, 30\)"):
         read_point(answer, u, v)
