@@ -35,10 +35,9 @@ def _picture(path: Path, role: Role, limits: ImageLimits) -> Picture:
     return Picture(shown(name), role, lambda: read_stored_frame(path.read_bytes(), limits))
 
 
-def calibrate_folder(folder: Path, task: Task, limits: ImageLimits, out: Path) -> Report:
-    """Calibrate under a progress bar, print what each photograph gave, and write the report and its plot."""
+def calibrate_folder(folder: Path, task: Task, limits: ImageLimits) -> Report:
+    """Calibrate under a progress bar, and print what each photograph gave."""
     pictures = pictures_in(folder, limits)
-    out.parent.mkdir(parents=True, exist_ok=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True)) as progress:
         bar = progress.add_task(f"{len(pictures)} photographs", total=1.0)
@@ -49,12 +48,16 @@ def calibrate_folder(folder: Path, task: Task, limits: ImageLimits, out: Path) -
         report = calibrate(task, pictures, tell=tell)
         progress.update(bar, completed=1.0)
     Console(markup=False, emoji=False).print(_table(report))  # a file's name is no markup
+    return report
+
+
+def write(report: Report, out: Path) -> None:
+    """The report as JSON, and the plot of a result beside it."""
     out.write_bytes(REPORT.dump_json(report, indent=1))
     if report.result is not None:
         from service.calibration.plot import as_svg
 
         out.with_name(f"{out.name.removesuffix('.json')}.svg").write_bytes(as_svg(report.result))
-    return report
 
 
 def _table(report: Report) -> Table:

@@ -1,5 +1,6 @@
 """The command ``camind``. Further commands come from packages that register in ``camind.commands``."""
 
+import io
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +14,7 @@ from sqlalchemy import Engine
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.config import Settings, SettingsError, load_settings
-from service.errors import BadRequest, CamindError
+from service.errors import BadRequest, CamindError, Conflict, NotFound
 from service.memory import end_uncollected, lasting
 from service.principal import EVERYDAY, LOCAL, SCOPES
 
@@ -46,6 +47,8 @@ def main() -> None:
         for entry_point in entry_points(group=GROUP):
             _add_commands(entry_point)
     end_uncollected()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # of a terminal that has not all letters
     app()
 
 
@@ -193,7 +196,7 @@ def calibrate(
     """Photographs of the sheet to a camera's k_cam, gamma, focus distance and intrinsics."""
     from service.calibration.calibrate import Task
     from service.calibration.target import CircleGrid
-    from service.calibration_folder import calibrate_folder, summary
+    from service.calibration_folder import calibrate_folder, summary, write
     from service.inference.images import ImageLimits
 
     if method == "paper" and focus_distance_m is None:
@@ -205,18 +208,23 @@ def calibrate(
             _require_storable(register)
         try:
             grid = CircleGrid(kind, rows, columns, spacing_mm, diameter_mm)
-            report = calibrate_folder(folder, Task(grid, focus_distance_m, method), limits, out)
+            out.parent.mkdir(parents=True, exist_ok=True)
+            report = calibrate_folder(folder, Task(grid, focus_distance_m, method), limits)
         except ValueError as exc:
             raise _failure(str(exc), WRONG_USE) from exc
     typer.echo("\n".join(summary(report)))
+    try:
+        if register is not None and report.result is not None:
+            from service.storage.cameras import Cameras
+
+            with _plain_failures(), _ready_engine() as engine:
+                record = Cameras(engine, owner).store_calibrated(register, report.result.to_camera())
+            typer.echo(f"stored as {record.name}, revision {record.revision}")
+    finally:
+        with _plain_failures():
+            write(report, out)
     if report.result is None:
         raise typer.Exit(1)
-    if register is not None:
-        from service.storage.cameras import Cameras
-
-        with _plain_failures(), _ready_engine() as engine:
-            record = Cameras(engine, owner).store_calibrated(register, report.result.to_camera())
-        typer.echo(f"stored as {record.name}, revision {record.revision}")
 
 
 @app.command()
@@ -245,14 +253,13 @@ def depth(
     with lasting():
         from service.depth_folder import Errand, depth_folder, query_of
         from service.inference.images import ImageLimits
-        from service.storage.cameras import Cameras
 
     asked = {"side": side, "focus_distance_m": focus_distance_m, "at": at or (), "known": known or (), "roi": roi}
     try:
         query = query_of(camera, asked, formats)
         with _plain_failures():
             with _ready_engine() as engine:
-                record = Cameras(engine, owner).get(camera)
+                record = _camera(engine, owner, camera)
             errand = Errand(record, query, formats, ImageLimits.of(settings), out)
             failed = depth_folder(photographs, errand, settings, is_missing_only=only_missing)
     except ValueError as exc:
@@ -285,9 +292,12 @@ def _seed(engine: Engine, owner: str) -> list[str]:
 @cameras_app.command(name="add")
 def add_camera(
     file: Annotated[typer.FileBinaryRead, typer.Argument(help="JSON as POST /cameras takes it; - for standard input")],
+    replace: Annotated[
+        bool, typer.Option("--replace", help="A new revision, where a camera of that name is there")
+    ] = False,
     owner: Annotated[str, typer.Option(help=OWNER_HELP)] = LOCAL,
 ) -> None:
-    """Store a new camera, known by its k_cam and gamma or by its lens specs."""
+    """Store a camera, known by its k_cam and gamma or by its lens specs."""
     import json
 
     from pydantic import ValidationError
@@ -303,9 +313,55 @@ def add_camera(
             raise _failure(str(invalid_model(exc, "body")), WRONG_USE) from exc
         except ValueError as exc:
             raise _failure(f"This is no JSON: {exc}", WRONG_USE) from exc
+        draft = body.to_draft(body.name)
         with _ready_engine() as engine:
-            record = Cameras(engine, owner).add(body.to_draft(body.name))
+            cameras = Cameras(engine, owner)
+            try:
+                record = cameras.add(draft)
+            except Conflict as exc:
+                if not replace:
+                    raise _failure(
+                        f"A camera '{body.name}' exists already: --replace gives it a new revision."
+                    ) from exc
+                record = cameras.replace(draft)
     typer.echo(_line_of(record))
+
+
+@cameras_app.command(name="show")
+def show_camera(
+    name: Annotated[str, typer.Argument(help="Of the camera")],
+    owner: Annotated[str, typer.Option(help=OWNER_HELP)] = LOCAL,
+) -> None:
+    """Print a camera as the JSON that add takes."""
+    from service.api.schemas import CameraCreate
+
+    with _plain_failures(), _ready_engine() as engine:
+        record = _camera(engine, owner, name)
+    typer.echo(CameraCreate.from_record(record).model_dump_json(indent=2, exclude_none=True))
+
+
+@cameras_app.command(name="delete")
+def delete_camera(
+    name: Annotated[str, typer.Argument(help="Of the camera")],
+    owner: Annotated[str, typer.Option(help=OWNER_HELP)] = LOCAL,
+) -> None:
+    """Free a camera's name; what was stored of it stays in the database."""
+    from service.storage.cameras import Cameras
+
+    with _plain_failures(), _ready_engine() as engine:
+        record = _camera(engine, owner, name)
+        Cameras(engine, owner).delete(name)
+    typer.echo(_line_of(record))
+
+
+def _camera(engine: Engine, owner: str, name: str) -> "CameraRecord":
+    from service.storage.cameras import Cameras
+
+    try:
+        return Cameras(engine, owner).get(name)
+    except NotFound as exc:
+        told = "camind cameras list names those there are, camind cameras add stores one"
+        raise _failure(f"There is no camera '{name[:64]}': {told}.") from exc
 
 
 @cameras_app.command(name="list")
@@ -473,6 +529,8 @@ def _plain_failures() -> Iterator[None]:
         yield
     except SQLAlchemyError as exc:
         raise _failure(f"The database cannot be used: {_reason(exc)}") from exc
+    except BrokenPipeError:
+        raise  # whoever read what is printed has enough
     except UnicodeEncodeError as exc:
         raise _failure(f"{ascii(exc.object)[:80]} is no text: its bytes are no UTF-8.", WRONG_USE) from exc
     except (CamindError, ModelFolderError, SettingsError, OSError) as exc:

@@ -64,6 +64,11 @@ class Made:
     focus_m: float | None = None
     remarks: str = ""
 
+    @property
+    def has_depth(self) -> bool:
+        """Whether there is an answer anywhere in it."""
+        return self.read is not None and self.read.valid_fraction > 0
+
 
 def depth_folder(places: Sequence[Path], errand: Errand, settings: Settings, *, is_missing_only: bool = False) -> int:
     """Write depth of the photographs named and of those in folders named, print a table; how many have none.
@@ -79,7 +84,7 @@ def depth_folder(places: Sequence[Path], errand: Errand, settings: Settings, *, 
         keep_freed_memory()
         errand.out.mkdir(parents=True, exist_ok=True)
         made = _all_made(wanted, errand, estimator, settings.worker_slots)
-        failed = sum(one.read is None for one in made.values())
+        failed = sum(not one.has_depth for one in made.values())
     there = f", and had that of {len(every) - len(wanted)}" if is_missing_only else ""
     told = f"{errand.out} has depth of {len(wanted) - failed} of {len(wanted)} photographs{there}"
     Console(soft_wrap=True, markup=False, emoji=False).print(told, highlight=False)
@@ -100,7 +105,8 @@ def _photographs(places: Sequence[Path], out: Path) -> list[Path]:
     first: dict[str, Path] = {}
     for path in every:
         if first.setdefault(path.stem, path) != path:
-            raise ValueError(f"{first[path.stem]} and {path} would become one file: give each an --out of its own")
+            remedy = f"name the photographs, such as {path.parent}/*{path.suffix}"
+            raise ValueError(f"{first[path.stem]} and {path} would become one file: {remedy}")
     return list(every)
 
 
@@ -142,8 +148,12 @@ def _made(photograph: Path, errand: Errand, estimator: Estimator, cancellation: 
 def _write(file: Path, body: bytes) -> None:
     """All of it or nothing: the name is given to what is there."""
     part = file.with_name(f".{file.name}.part")
-    part.write_bytes(body)
-    part.replace(file)
+    try:
+        part.write_bytes(body)
+        part.replace(file)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
 
 
 def _print(made: Sequence[tuple[Path, Made]]) -> None:

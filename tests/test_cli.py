@@ -17,6 +17,7 @@ import typer
 from typer.testing import CliRunner, Result
 
 from service import cli
+from service.api.schemas import LENS_EXAMPLE
 from service.storage import schema
 from tests.inference.oracle_pair import brightness_for
 from tests.simulated_sheets import CAMERA, DEPTHS_M, shots
@@ -232,6 +233,42 @@ def test_what_is_no_new_camera_is_said(specs: str, code: int, said: str) -> None
     assert refused.exit_code == code
     assert said in refused.stderr
     assert at_once("cameras", "list").stdout.count("\n") == 1
+
+
+@pytest.mark.parametrize("known_by", [{}, {"k_cam_px": None, "lens": LENS_EXAMPLE["lens"]}], ids=["k_cam", "lens"])
+@pytest.mark.usefixtures("bench")
+def test_a_camera_is_shown_as_what_stores_it_and_replaced_and_deleted(known_by: dict[str, object]) -> None:
+    told = {**BENCH, "name": "other", "description": "on the bench", **known_by}
+    assert at_once("cameras", "add", "-", said=json.dumps(told)).exit_code == 0
+    shown = at_once("cameras", "show", "other").stdout
+    assert json.loads(shown) == {name: value for name, value in told.items() if value is not None}
+    assert "--replace" in at_once("cameras", "add", "-", said=shown).stderr
+    assert "\tr2\t" in at_once("cameras", "add", "--replace", "-", said=shown).stdout
+    assert at_once("cameras", "delete", "other").exit_code == 0
+    for command in ("show", "delete"):
+        gone = at_once("cameras", command, "other")
+        assert gone.exit_code == 1
+        assert "There is no camera 'other': camind cameras list" in gone.stderr
+
+
+def test_a_photograph_in_which_nothing_is_seen_has_no_depth(bench: Path) -> None:
+    cv2.imwrite(str(bench / "black.png"), np.zeros((48, 64, 3), np.uint8))
+    told = at_once("depth", "black.png", "--camera", "bench")
+    assert told.exit_code == 1
+    assert "has depth of 0 of 1 photographs" in told.stdout
+
+
+def test_nothing_is_left_in_the_user_s_home(tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    home.mkdir()
+    cv2.imwrite(str(tmp_path / "grey.png"), np.full((48, 64, 3), 128, np.uint8))
+    camera = tmp_path / "camera.json"
+    camera.write_text(json.dumps(BENCH))
+    own = {"HOME": str(home), "XDG_CACHE_HOME": "", "XDG_CONFIG_HOME": "", "XDG_DATA_HOME": ""}
+    assert camind(tmp_path, "cameras", "add", str(camera), **own).returncode == 0
+    asked = ("depth", str(tmp_path / "grey.png"), "--camera", "bench", "--out", str(tmp_path / "depth"))
+    assert camind(tmp_path, *asked, **own).returncode == 0
+    assert list(home.rglob("*")) == []
 
 
 def test_a_folder_of_photographs_becomes_depth(bench: Path, tiny_model_dir: Path) -> None:

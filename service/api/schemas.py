@@ -196,6 +196,22 @@ class CameraCreate(CameraSpecs):
 
     name: Name
 
+    @classmethod
+    def from_record(cls, record: CameraRecord) -> Self:
+        """What registers a stored camera anew."""
+        camera, lens = record.camera, record.draft.lens
+        return cls(
+            name=record.name,
+            image_width_px=camera.image_width_px,
+            image_height_px=camera.image_height_px,
+            focus_distance_m=camera.focus_distance_m,
+            k_cam_px=None if lens else camera.k_cam_px,
+            lens=_lens_read(lens),
+            gamma_px=camera.gamma_px,
+            intrinsics=PinholeIntrinsics.from_domain(camera.intrinsics) if camera.intrinsics else None,
+            description=record.draft.description,
+        )
+
 
 class CameraReplace(CameraSpecs):
     """A camera's next revision, whole; what is left out takes its default."""

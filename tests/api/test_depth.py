@@ -286,7 +286,7 @@ def test_known_depths_tell_where_this_shot_was_focused(bench: TestClient) -> Non
 def test_known_depths_are_of_the_whole_whatever_part_is_asked_for(bench: TestClient) -> None:
     whole, part = (ask(bench, format="npy", known="90,60,1.1", roi=roi) for roi in (None, "0,0,32,32"))
     np.testing.assert_allclose(npy(part), npy(whole)[:32, :32], rtol=1e-4)
-    problem = refused(ask(bench, known="96,3,1.1"), 422, "96x64")
+    problem = refused(ask(bench, known="96,3,1.1"), 422, "(0, 0) to (96, 64)")
     assert problem["errors"][0]["pointer"] == "known"
 
 
@@ -304,8 +304,8 @@ def test_known_depths_are_of_the_whole_whatever_part_is_asked_for(bench: TestCli
         ({"at": "12"}, "u,v"),
         ({"at": "a,b"}, "u,v"),
         ({"at": "nan,1"}, "u,v"),
-        ({"at": "96,3", "format": "json"}, "96x64"),
-        ({"at": "3,-1", "format": "json"}, "96x64"),
+        ({"at": "96,3", "format": "json"}, "(0, 0) to (96, 64)"),
+        ({"at": "3,-1", "format": "json"}, "(0, 0) to (96, 64)"),
         ({"known": "3,4"}, "u,v,depth_m"),
         ({"known": "3,4,0"}, "u,v,depth_m"),
         ({"known": "3,4,-1"}, "u,v,depth_m"),
@@ -396,7 +396,7 @@ def test_what_is_no_part_of_the_photograph_is_refused_by_name(bench: TestClient,
 
 
 def test_a_point_outside_the_part_is_refused(bench: TestClient) -> None:
-    refused(ask(bench, format="json", roi="10,20,41,50", at="9,21"), 422, "(9, 21)", "31x30", "(10, 20)")
+    refused(ask(bench, format="json", roi="10,20,41,50", at="9,21"), 422, "(9, 21)", "(10, 20) to (41, 50)")
 
 
 def test_no_room_is_503_with_retry_after(settings: Settings, app: FastAPI) -> None:
