@@ -238,7 +238,8 @@ def test_what_is_no_new_camera_is_said(specs: str, code: int, said: str) -> None
 @pytest.mark.parametrize("known_by", [{}, {"k_cam_px": None, "lens": LENS_EXAMPLE["lens"]}], ids=["k_cam", "lens"])
 @pytest.mark.usefixtures("bench")
 def test_a_camera_is_shown_as_what_stores_it_and_replaced_and_deleted(known_by: dict[str, object]) -> None:
-    told = {**BENCH, "name": "other", "description": "on the bench", **known_by}
+    inner = {"fx_px": 60.5, "fy_px": 61.0, "cx_px": 31.5, "cy_px": 23.5, "distortion": [0.1, 0.0, 0.0, 0.0]}
+    told = {**BENCH, "name": "other", "description": "on the bench", "intrinsics": inner, **known_by}
     assert at_once("cameras", "add", "-", said=json.dumps(told)).exit_code == 0
     shown = at_once("cameras", "show", "other").stdout
     assert json.loads(shown) == {name: value for name, value in told.items() if value is not None}

@@ -200,6 +200,7 @@ class CameraCreate(CameraSpecs):
     def from_record(cls, record: CameraRecord) -> Self:
         """What registers a stored camera anew."""
         camera, lens = record.camera, record.draft.lens
+        inner = IntrinsicsRead.from_domain(camera.intrinsics).model_dump() if camera.intrinsics else None
         return cls(
             name=record.name,
             image_width_px=camera.image_width_px,
@@ -208,7 +209,7 @@ class CameraCreate(CameraSpecs):
             k_cam_px=None if lens else camera.k_cam_px,
             lens=_lens_read(lens),
             gamma_px=camera.gamma_px,
-            intrinsics=PinholeIntrinsics.from_domain(camera.intrinsics) if camera.intrinsics else None,
+            intrinsics=PinholeIntrinsics.model_validate(inner) if inner else None,
             description=record.draft.description,
         )
 
