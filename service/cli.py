@@ -19,6 +19,7 @@ from service.memory import end_uncollected, lasting
 from service.principal import EVERYDAY, LOCAL, SCOPES
 
 if TYPE_CHECKING:
+    from service.calibration.report import Result
     from service.storage.cameras import CameraRecord
 
 GROUP = "camind.commands"
@@ -215,16 +216,20 @@ def calibrate(
     typer.echo("\n".join(summary(report)))
     try:
         if register is not None and report.result is not None:
-            from service.storage.cameras import Cameras
-
-            with _plain_failures(), _ready_engine() as engine:
-                record = Cameras(engine, owner).store_calibrated(register, report.result.to_camera())
-            typer.echo(f"stored as {record.name}, revision {record.revision}")
+            _store_calibrated(register, report.result, owner)
     finally:
         with _plain_failures():
             write(report, out)
     if report.result is None:
         raise typer.Exit(1)
+
+
+def _store_calibrated(name: str, result: "Result", owner: str) -> None:
+    from service.storage.cameras import Cameras
+
+    with _plain_failures(), _ready_engine() as engine:
+        record = Cameras(engine, owner).store_calibrated(name, result.to_camera())
+    typer.echo(f"stored as {record.name}, revision {record.revision}")
 
 
 @app.command()
