@@ -4,6 +4,7 @@ import json
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -543,3 +544,11 @@ def test_what_has_no_result_is_not_accepted(client: TestClient, fake: FakeCalibr
     refused(client.post(f"{path}/accept", json={}), 409, None, "no result")
     refused(client.post(f"{path}/accept", json={"camera": "no name"}), 422, "#/camera")
     refused(client.post(f"/calibrations/{'0' * 32}/accept", json={}), 404)
+
+
+def test_what_is_being_received_waits_too(client: TestClient, app: FastAPI) -> None:
+    with ExitStack() as arriving:
+        for _ in range(3):
+            arriving.enter_context(app.state.spool.receiving(uuid4().hex))
+        refused(send(client), 503)
+    assert send(client).status_code == 202

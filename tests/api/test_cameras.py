@@ -416,3 +416,9 @@ def test_no_content_has_no_type(client: TestClient, phone: dict[str, Any]) -> No
     answer = client.delete(f"/cameras/{phone['name']}")
     assert (answer.status_code, answer.content) == (204, b"")
     assert "content-type" not in answer.headers
+
+
+def test_a_curve_may_end_before_where_it_begins_by_itself(client: TestClient, phone: dict[str, Any]) -> None:
+    client.post("/cameras", json=phone)
+    within = client.get("/cameras/pixel7-wide/curve?far_m=0.1").json()["points"]
+    assert (within[0]["depth_m"], within[-1]["depth_m"]) == pytest.approx((0.02, 0.1))

@@ -139,3 +139,38 @@ def test_too_few_circles_are_an_error_and_one_picture_a_warning() -> None:
         fit_constants(circles((0.6,), per_picture=3))
     one = fit_constants(circles((0.6,)), FOCUS, resamples=20)
     assert any("fewer than three" in warning for warning in one.warnings)
+
+
+def test_pictures_in_focus_show_gamma_alone() -> None:
+    some = circles((*BOTH_SIDES, 0.5))
+    is_focused = some.picture == len(BOTH_SIDES)
+    some = replace(some, blur_px=np.where(is_focused, GAMMA, some.blur_px), is_focused=is_focused)
+    found = fit_constants(some, resamples=0)
+    assert found.k_cam_px.value == pytest.approx(K_CAM, rel=0.03)
+    assert found.gamma_px.value == pytest.approx(GAMMA, rel=0.03)
+
+
+def test_what_depths_are_off_by_together_is_in_the_intervals() -> None:
+    some = circles(BOTH_SIDES, error=0.002)
+    sure, unsure = (fit_constants(some, depth_error=error, resamples=40).focus_distance_m for error in (0.0, 0.03))
+    assert unsure.relative_width > 4 * 0.03 > 2 * sure.relative_width
+
+
+def test_of_one_picture_circles_are_drawn() -> None:
+    exact, noisy = (fit_constants(circles((0.6,), error=error), FOCUS, resamples=20).k_cam_px for error in (0.0, 0.1))
+    assert noisy.relative_width > 3 * exact.relative_width
+
+
+@pytest.mark.parametrize(("depths_m", "side"), [((0.5, 0.6, 0.7), "nearer than"), ((1.7, 2.0, 2.4), "beyond")])
+def test_the_one_side_is_named(depths_m: tuple[float, ...], side: str) -> None:
+    warnings = fit_constants(circles(depths_m, error=0.002), resamples=0).warnings
+    assert any(f"all circles are {side} the focus" in warning for warning in warnings)
+
+
+def test_a_picture_a_little_off_with_a_few_wrong_circles_is_not_odd() -> None:
+    some = circles(BOTH_SIDES)
+    blur = np.where(some.picture == 3, 1.15 * some.blur_px, some.blur_px)
+    blur[np.flatnonzero(some.picture == 3)[:4]] *= 2.5
+    wrong = replace(some, blur_px=blur)
+    found = fit_constants(wrong, resamples=0)
+    assert odd_pictures(wrong, found) == []

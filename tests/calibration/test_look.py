@@ -80,3 +80,13 @@ def test_a_look_stops_while_it_searches_for_the_sheet() -> None:
             dots[v : v + 9, u : u + 9] = 0
     with pytest.raises(Stopped):
         look(dots, SHEETS[0], None, check)
+
+
+def test_a_partner_of_another_size_does_not_serve() -> None:
+    rng = np.random.default_rng(3)
+    taken = photograph(rng, CAMERA, draw_pose(rng, CAMERA, SHEETS[0], 0.42), SHEETS[0], focused=True)
+    partner, out = (Measured(PictureReport("", "defocused", found=False)) for _ in range(2))
+    measure(partner, taken, SHEETS[0], lambda _: None)
+    measure(out, np.full((300, 400, 3), 200, np.uint8), SHEETS[0], lambda _: None, partner=partner)
+    assert partner.grid is not None
+    assert out.grid is None

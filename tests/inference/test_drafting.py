@@ -210,3 +210,9 @@ def test_damaged_exif_harms_nobody() -> None:
         for _ in range(draw.randint(1, 12)):
             damaged[draw.randrange(len(whole))] = draw.randrange(256)
         draft_camera(read_exif(bytes(damaged[: draw.randint(1, len(whole))])), 8, 8)
+
+
+@pytest.mark.parametrize(("unit", "pixels"), [(2, 4198), (3, 1653), (4, 165), (5, 0.1653)])
+def test_a_pixel_is_as_wide_in_every_unit(unit: int, pixels: float) -> None:
+    found = read_exif(exif_of({}, {PLANE_RESOLUTION: (round(1e4 * pixels), 10_000), PLANE_UNIT: unit}))
+    assert found.focal_plane_pitch_um == pytest.approx(6.05, rel=2e-3)

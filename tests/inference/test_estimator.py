@@ -3,6 +3,7 @@
 import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,8 +13,10 @@ from service.inference.artifact import Interval, load_model_folder
 from service.inference.cancellation import Cancellation, Cancelled
 from service.inference.depth_map import LEAST_BLUR_ERROR_PX, Reading, all_layers, decide
 from service.inference.estimator import SURROUNDINGS_PX, Estimator
+from service.inference.known import KnownDepth
 from service.inference.pair import MAPS, GraphPair, RawMaps, Side
 from service.inference.part import Part
+from service.inference.session import Graph
 from service.optics import thin_lens
 from service.optics.camera import Camera, Intrinsics
 from tests.inference.oracle_pair import LOG_DEPTH_SCALE, blur_of, brightness_for, build_oracle_pair
@@ -491,3 +494,72 @@ def test_the_stages_are_timed(estimator: Estimator) -> None:
     timings = estimator.estimate(grey(60), CAMERA).timings_ms
     assert set(timings) == {"blur", "correct", "depth", "encode"}
     assert all(spent > 0 for spent in timings.values())
+
+
+@pytest.mark.parametrize(("side", "hint"), [("auto", 0.0), ("near", -1.0), ("far", 1.0)])
+def test_the_depth_graph_is_told_the_side_and_the_camera(
+    estimator: Estimator, monkeypatch: pytest.MonkeyPatch, side: Side, hint: float
+) -> None:
+    run = Graph.run
+    fed: list[Any] = []
+
+    def noting(graph: Graph, feeds: Any, *options: Any, **named: Any) -> Any:
+        fed.append(feeds)
+        return run(graph, feeds, *options, **named)
+
+    monkeypatch.setattr(Graph, "run", noting)
+    estimator.estimate(grey(60), replace(CAMERA, intrinsics=Intrinsics(300, 300, 47.5, 31.5)), side)
+    told = [[float(feeds[name][0]) for name in ("side", "focal_length_px", "focus_distance_m")] for feeds in fed[1:]]
+    assert told == [[hint, 300.0, 2.0]]
+
+
+def test_errors_grow_where_k_cam_is_smaller_than_the_model_knows(estimator: Estimator) -> None:
+    weak = Camera(96, 64, 2.0, 0.1, 0.5)
+    answer = estimator.estimate(grey(15), weak, "near")
+    np.testing.assert_allclose(answer.sigma_m / answer.depth_m, 5 * np.sqrt(2) * LOG_DEPTH_SCALE, rtol=0.01)
+
+
+def test_what_optics_cannot_tell_has_no_answer(estimator: Estimator) -> None:
+    assert not estimator.estimate(grey(12), Camera(96, 64, 2.0, 0.03, 0.5), "near").valid.any()
+
+
+def test_gamma_of_a_copy_is_told_for_the_photograph(estimator: Estimator) -> None:
+    picture = half_sharp(1.0).repeat(2, 0).repeat(2, 1)
+    answer = estimator.estimate(picture, Camera(192, 128, 2.0, 24.0, gamma_px=6.0), "near")
+    assert answer.scales[0] == 0.5
+    sharp_px = thin_lens.gamma_before_averaging(blur_of(brightness_for(1.0)), 192, 96)
+    assert answer.camera.gamma_px == pytest.approx(sharp_px, rel=1e-3)
+
+
+def test_blur_of_a_copy_is_held_against_what_the_model_knows_of_it(tmp_path: Path) -> None:
+    limited = Estimator.from_folder(load_model_folder(build_oracle_pair(tmp_path / "m", blur_range=Interval(0.3, 5.0))))
+    answer = limited.estimate(grey(brightness_for(4.0), 400, 600), Camera(600, 400, 2.0, 48.0, 0.5), "near")
+    assert answer.scales[0] == 0.25
+    assert not any("more blur" in warning for warning in answer.warnings)
+
+
+def test_gamma_is_what_is_seen_where_depths_are_known_too(estimator: Estimator) -> None:
+    soft = replace(CAMERA, gamma_px=6 * CAMERA.gamma_px)
+    answer = estimator.estimate(half_sharp(1.0), soft, "near", known=[KnownDepth(10, 10, 2.0)])
+    assert answer.warnings[0].startswith("gamma_px taken as 1.02, where 3 was told")
+
+
+def test_gamma_is_that_of_all_the_photograph_where_a_part_is_read(estimator: Estimator) -> None:
+    picture = grey(130, 512, 1152)
+    picture[256:] = brightness_for(1.0)
+    soft = Camera(1152, 512, 2.0, 4.0, gamma_px=3.0)
+    answer = estimator.estimate(picture, soft, "near", part=Part(0, 0, 30, 30))
+    assert answer.camera.gamma_px == pytest.approx(blur_of(brightness_for(1.0)), rel=1e-3)
+
+
+@pytest.mark.parametrize("side", ["near", "far"])
+def test_answers_in_doubt_stay_on_the_side_that_is_asked_for(tmp_path: Path, side: Side) -> None:
+    doubtful = Estimator.from_folder(load_model_folder(build_oracle_pair(tmp_path / "m", depth_scale=0.3)))
+    across = np.mgrid[:64, :96][1]
+    picture = np.repeat((13 + 100 * np.abs(np.sin(across / 20)) ** 3)[..., None], 3, 2).astype(np.uint8)
+    depth_m = doubtful.estimate(picture, CAMERA, side).depth_m
+    assert np.nanmax(depth_m) <= 2.0 if side == "near" else np.nanmin(depth_m) >= 2.0
+
+
+def test_a_part_may_be_one_pixel(estimator: Estimator) -> None:
+    assert estimator.estimate(grey(60), CAMERA, "near", part=Part(10, 10, 11, 11)).valid.all()

@@ -11,7 +11,7 @@ from service.inference.artifact import load_model_folder
 from service.inference.cancellation import Cancellation
 from service.inference.estimator import Estimator
 from service.inference.known import KnownDepth
-from service.inference.pair import GraphPair, RawMaps, Side
+from service.inference.pair import GraphPair, RawMaps, Side, Sights
 from service.inference.part import Part
 from service.optics.camera import Camera
 from tests.inference.oracle_pair import brightness_for, build_oracle_pair
@@ -204,3 +204,79 @@ def test_pixels_may_be_at_the_very_edge(estimator: Estimator, at: tuple[float, f
     depth_m = LEFT_M if at[0] < 192 else RIGHT_M
     answer = estimator.estimate(photograph(), TOLD, known=[KnownDepth(*at, depth_m)])
     assert 1.7 < answer.camera.focus_distance_m < 2.0
+
+
+def test_what_was_seen_may_be_written_over() -> None:
+    sights, picture = Sights(), np.zeros((8, 8, 3), np.uint8)
+    sights.of(picture, lambda: {"blur_px": np.ones(3, np.float32)})["blur_px"] *= 2
+    assert (sights.of(picture, dict)["blur_px"] == 1).all()
+
+
+LARGE = Camera(1200, 900, 2.0, 4.0, 0.5)
+
+
+def large_photograph() -> NDArray[np.uint8]:
+    picture = np.empty((900, 1200, 3), np.uint8)
+    true = LARGE.focused_at(1.8)
+    picture[:] = brightness_for(true.blur_px(RIGHT_M))
+    picture[640:700, 800:900] = brightness_for(true.blur_px(LEFT_M))
+    return picture
+
+
+def test_known_depths_of_a_large_photograph_are_read_where_they_are(estimator: Estimator) -> None:
+    known = [KnownDepth(850, 670, LEFT_M), KnownDepth(700, 400, RIGHT_M)]
+    answer = estimator.estimate(large_photograph(), LARGE, known=known)
+    assert answer.camera.focus_distance_m == pytest.approx(1.8, rel=0.05)
+    assert answer.depth_m[670, 850] == pytest.approx(LEFT_M, rel=0.05)
+    part = Part(700, 600, 950, 750)
+    asked = estimator.estimate(large_photograph(), LARGE, part=part, known=known)
+    middle = slice(50, 90), slice(110, 190)
+    np.testing.assert_allclose(asked.depth_m[middle], part.of(answer.depth_m)[middle], rtol=0.01)
+    np.testing.assert_allclose(asked.p_near[middle], part.of(answer.p_near)[middle], atol=0.02)
+
+
+def test_on_a_copy_the_tape_holds_too(estimator: Estimator) -> None:
+    large = replace(TOLD, k_cam_px=24.0)
+    true = large.focused_at(1.8)
+    picture = np.empty((256, 384, 3), np.uint8)
+    picture[:, :192], picture[:, 192:] = (brightness_for(true.blur_px(z) / 2) for z in (1.3, 2.4))
+    others = (KnownDepth(u, 180, 1.3) for u in (60, 120, 140, 160))
+    known = [KnownDepth(330, 40, 2.4), *others, KnownDepth(20, 20, 0.93 * 1.3)]
+    answer = estimator.estimate(picture, large, "near", known=known)
+    assert answer.depth_m[20, 20] == pytest.approx(0.93 * 1.3, rel=0.01)
+
+
+def test_no_tape_moves_an_answer_over_focus(estimator: Estimator) -> None:
+    picture = photograph()
+    picture[10:60, 10:60] = brightness_for(TRUE.blur_px(1.6))
+    known = (*KNOWN[:1], *(KnownDepth(u, 200, LEFT_M) for u in (90, 120, 150)), KnownDepth(35, 35, 1.9))
+    answer = estimator.estimate(picture, TOLD, "near", known=known)
+    assert answer.depth_m[35, 35] == pytest.approx(answer.camera.focus_distance_m, rel=0.02)
+    assert (answer.depth_m <= answer.camera.focus_distance_m).all()
+
+
+@pytest.mark.parametrize(("side", "pixel"), [("near", (330, 40)), ("far", (60, 120))])
+def test_a_known_depth_on_the_other_side_moves_nothing(
+    estimator: Estimator, side: Side, pixel: tuple[int, int]
+) -> None:
+    answer = estimator.estimate(photograph(red=EVENLY), TOLD, side, known=KNOWN)
+    blurs = estimator.estimate(photograph(red=EVENLY), answer.camera, side)
+    u, v = pixel
+    assert answer.depth_m[v, u] == pytest.approx(blurs.depth_m[v, u], rel=0.02)
+
+
+def test_a_known_depth_makes_no_answer(estimator: Estimator) -> None:
+    picture = photograph()
+    picture[:60, :60] = brightness_for(1.4 * TRUE.k_cam_px)
+    answer = estimator.estimate(picture, TOLD, "far", known=(*KNOWN, KnownDepth(20, 20, 0.7)))
+    assert not answer.valid[20, 20]
+    assert answer.valid[40, 330]
+
+
+def test_a_part_may_be_far_from_what_is_known(estimator: Estimator) -> None:
+    camera = Camera(1200, 900, 2.0, 4.0, 0.5)
+    picture = np.full((900, 1200, 3), brightness_for(camera.blur_px(LEFT_M)), np.uint8)
+    part = Part(0, 0, 100, 50)
+    answer = estimator.estimate(picture, camera, part=part, known=[KnownDepth(1100, 800, LEFT_M)])
+    assert answer.depth_m.shape == (50, 100)
+    np.testing.assert_allclose(answer.depth_m, LEFT_M, rtol=0.05)

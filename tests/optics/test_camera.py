@@ -115,3 +115,18 @@ def test_a_lens_that_tilts_loses_its_tilt_only_in_a_picture_that_is_turned() -> 
     assert inner.turned(False, False, False, (640, 480)).distortion == terms
     assert inner.turned(False, True, True, (640, 480)).distortion[2:4] == (-terms[2], -terms[3])
     assert len(inner.turned(False, True, True, (640, 480)).distortion) == 12
+
+
+def test_both_axes_follow_their_own_ratio() -> None:
+    scaled = Intrinsics(500, 510, 319.5, 239.5).scaled(0.5, 0.25)
+    assert (scaled.fx_px, scaled.fy_px) == (250, 127.5)
+
+
+def test_a_range_never_begins_beyond_its_end() -> None:
+    near, far = Camera(640, 480, 2.0, 0.05, focal_length_m=0.05).range_m
+    assert near == far == pytest.approx(0.1 * 2.0 * 0.05 / 0.25)
+
+
+def test_a_thumbnail_is_of_the_same_frame() -> None:
+    frame = Camera(645, 432, 2.0, 1.53)
+    assert frame.is_same_frame(16, 11)
