@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from model_export.render import DISC, GAUSSIAN, PointSpread, blur
-from service.calibration.edge import EdgeError, fit_edge
+from service.calibration.edge import EdgeError, fit_edge, slice_blur
 
 SIZE = 128
 FINE = 8
@@ -101,3 +101,13 @@ def test_what_cannot_be_measured_is_said(
 ) -> None:
     with pytest.raises(EdgeError, match=why):
         fit_edge(light, *place)
+
+
+def test_the_papers_slice_reads_a_third_more() -> None:
+    total = math.sqrt(4.0**2 + 1 / 12)
+    assert slice_blur(photographed(circle(), 4.0, GAUSSIAN), 63.3, 64.8, 24) == pytest.approx(1.329 * total, rel=0.03)
+
+
+def test_a_narrow_ellipse_is_too_tilted() -> None:
+    with pytest.raises(EdgeError, match="too tilted"):
+        fit_edge(photographed(circle(30, axes_ratio=0.36), 1.5, GAUSSIAN), 64, 64, 20)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from service.calibration.pose import PoseError, View, place
+from service.calibration.pose import PoseError, View, place, stand
 from service.calibration.target import CircleGrid
 from service.opencv import cv2
 
@@ -109,3 +109,18 @@ def test_another_camera_s_view_does_not_fit() -> None:
     seen[3] = View(seen[3].circles, (seen[3].centres_px - 480) * 1.3 + 480)
     found = place(GRID, seen, SIZE)
     assert np.argmax(found.rms_px) == 3
+
+
+def test_one_sheet_that_is_not_tilted_is_no_matter() -> None:
+    (straight, *_), _ = views(flat(), tilted=0.0)
+    tilted, _ = views(flat())
+    assert not any("never tilted" in warning for warning in place(GRID, [straight, *tilted[1:]], SIZE).warnings)
+    assert any("never tilted" in warning for warning in place(GRID, views(flat(), tilted=0.15)[0], SIZE).warnings)
+
+
+def test_a_sheet_stands_where_it_was_placed() -> None:
+    seen, _ = views(flat())
+    found = place(GRID, seen, SIZE)
+    for number, view in enumerate(seen):
+        expected = found.distance_m[number], found.tilt_deg[number]
+        assert stand(GRID, view, found.intrinsics) == pytest.approx(expected, rel=0.02)
