@@ -36,7 +36,8 @@ cameras_app = typer.Typer(help="The cameras in the database.", no_args_is_help=T
 app.add_typer(cameras_app, name="cameras")
 keys_app = typer.Typer(help="The API keys: who may use the service.", no_args_is_help=True)
 app.add_typer(keys_app, name="keys")
-OWNER_HELP = "Whose they are. [default: whoever uses the service without a key]"
+Owner = Annotated[str, typer.Option(help="Whose they are. [default: whoever uses the service without a key]")]
+CameraName = Annotated[str, typer.Argument(help="Of the camera")]
 
 
 def main() -> None:
@@ -192,7 +193,7 @@ def calibrate(
         "calibration.json"
     ),
     register: Annotated[str | None, typer.Option(help="Camera to store, or to give a new revision")] = None,
-    owner: Annotated[str, typer.Option(help=OWNER_HELP)] = LOCAL,
+    owner: Owner = LOCAL,
 ) -> None:
     """Photographs of the sheet to a camera's k_cam, gamma, focus distance and intrinsics."""
     from service.calibration.calibrate import Task
@@ -248,7 +249,7 @@ def depth(
     roi: Annotated[str | None, typer.Option(help="Part u0,v0,u1,v1 to answer alone")] = None,
     only_missing: Annotated[bool, typer.Option("--only-missing", help="Leave out what is there already")] = False,
     model: Annotated[Path | None, typer.Option(help="Model folder. [default: the shipped model]")] = None,
-    owner: Annotated[str, typer.Option(help=OWNER_HELP)] = LOCAL,
+    owner: Owner = LOCAL,
 ) -> None:
     """Photographs to depth, without a service: what POST /depth answers, into files.
 
@@ -280,7 +281,7 @@ def print_version() -> None:
 
 
 @cameras_app.command(name="seed")
-def seed_cameras(owner: Annotated[str, typer.Option(help=OWNER_HELP)] = LOCAL) -> None:
+def seed_cameras(owner: Owner = LOCAL) -> None:
     """Store the cameras of the paper's Table 1; names already there are left as they are."""
     with _plain_failures(), _ready_engine() as engine:
         names = _seed(engine, owner)
@@ -300,7 +301,7 @@ def add_camera(
     replace: Annotated[
         bool, typer.Option("--replace", help="A new revision, where a camera of that name is there")
     ] = False,
-    owner: Annotated[str, typer.Option(help=OWNER_HELP)] = LOCAL,
+    owner: Owner = LOCAL,
 ) -> None:
     """Store a camera, known by its k_cam and gamma or by its lens specs."""
     import json
@@ -333,10 +334,7 @@ def add_camera(
 
 
 @cameras_app.command(name="show")
-def show_camera(
-    name: Annotated[str, typer.Argument(help="Of the camera")],
-    owner: Annotated[str, typer.Option(help=OWNER_HELP)] = LOCAL,
-) -> None:
+def show_camera(name: CameraName, owner: Owner = LOCAL) -> None:
     """Print a camera as the JSON that add takes."""
     from service.api.schemas import CameraCreate
 
@@ -346,10 +344,7 @@ def show_camera(
 
 
 @cameras_app.command(name="delete")
-def delete_camera(
-    name: Annotated[str, typer.Argument(help="Of the camera")],
-    owner: Annotated[str, typer.Option(help=OWNER_HELP)] = LOCAL,
-) -> None:
+def delete_camera(name: CameraName, owner: Owner = LOCAL) -> None:
     """Free a camera's name; what was stored of it stays in the database."""
     from service.storage.cameras import Cameras
 
@@ -370,7 +365,7 @@ def _camera(engine: Engine, owner: str, name: str) -> "CameraRecord":
 
 
 @cameras_app.command(name="list")
-def list_cameras(owner: Annotated[str, typer.Option(help=OWNER_HELP)] = LOCAL) -> None:
+def list_cameras(owner: Owner = LOCAL) -> None:
     """Print name, revision, k_cam, focus distance and image size, a camera a line."""
     from service.storage.cameras import Cameras
 

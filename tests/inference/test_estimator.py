@@ -119,14 +119,6 @@ def test_no_photograph_is_sharper_than_its_gamma(estimator: Estimator) -> None:
     assert answer.warnings == ("gamma_px taken as 1.02, where 3 was told: the photograph is sharper than that",)
 
 
-def test_gamma_is_that_of_the_whole_photograph_where_a_part_is_read(estimator: Estimator) -> None:
-    picture = np.tile(half_sharp(1.0), (8, 12, 1))
-    soft = Camera(picture.shape[1], picture.shape[0], 2.0, 4.0, gamma_px=3.0)
-    blurred_alone = Part(picture.shape[1] - 30, 0, picture.shape[1], 30)
-    answer = estimator.estimate(picture, soft, "near", part=blurred_alone)
-    assert answer.camera.gamma_px == pytest.approx(blur_of(brightness_for(1.0)), rel=1e-3)
-
-
 @pytest.mark.parametrize("gamma_px", [0.0, 0.5, 1.3])
 def test_a_gamma_that_may_be_true_is_taken(estimator: Estimator, gamma_px: float) -> None:
     answer = estimator.estimate(half_sharp(1.0), replace(CAMERA, gamma_px=gamma_px), "near")
