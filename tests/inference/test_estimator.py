@@ -536,9 +536,12 @@ def test_gamma_is_what_is_seen_where_depths_are_known_too(estimator: Estimator) 
     assert answer.warnings[0].startswith("gamma_px taken as 1.02, where 3 was told")
 
 
-def test_gamma_is_that_of_all_the_photograph_where_a_part_is_read(estimator: Estimator) -> None:
+@pytest.mark.parametrize("sharp", [np.s_[256:], np.s_[:, 576:]], ids=["below", "beyond what the part is read with"])
+def test_gamma_is_that_of_all_the_photograph_where_a_part_is_read(
+    estimator: Estimator, sharp: slice | tuple[slice, slice]
+) -> None:
     picture = grey(130, 512, 1152)
-    picture[256:] = brightness_for(1.0)
+    picture[sharp] = brightness_for(1.0)
     soft = Camera(1152, 512, 2.0, 4.0, gamma_px=3.0)
     answer = estimator.estimate(picture, soft, "near", part=Part(0, 0, 30, 30))
     assert answer.camera.gamma_px == pytest.approx(blur_of(brightness_for(1.0)), rel=1e-3)
