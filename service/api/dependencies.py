@@ -8,7 +8,6 @@ from typing import Annotated, get_origin
 from fastapi import Depends, Header, Request, params
 from fastapi.dependencies.utils import get_flat_params
 
-from service.api.metrics import Metrics
 from service.api.problems import invalid_request
 from service.api.texts import Worded
 from service.config import Settings
@@ -66,11 +65,6 @@ async def get_runner(request: Request) -> Runner:
     return runner
 
 
-async def get_metrics(request: Request) -> Metrics:
-    metrics: Metrics = request.app.state.metrics
-    return metrics
-
-
 async def require_known_parameters(request: Request) -> None:
     """Refuse what the query has and the route does not know, and all but lists that come more than once."""
     names = [name for name, _ in request.query_params.multi_items()]
@@ -114,4 +108,3 @@ WorkerDep = Annotated[Worker, Depends(get_worker)]
 CalibrationsDep = Annotated[Calibrations, Depends(get_calibrations)]
 SpoolDep = Annotated[Spool, Depends(get_spool)]
 RunnerDep = Annotated[Runner, Depends(get_runner)]
-MetricsDep = Annotated[Metrics, Depends(get_metrics)]
