@@ -78,12 +78,12 @@ class _ProblemResponse(Response):
         await super().__call__(scope, receive, send)
 
 
-def problem_response(error: CamindError, headers: Mapping[str, str] | None = None) -> Response:
+def problem_response(error: CamindError) -> Response:
     """The error as a response, with the headers that belong to it."""
     response = _ProblemResponse(
         problem(error).model_dump_json(exclude_none=True),
         status_code=error.status,
-        headers={"Cache-Control": "no-store", **(headers or {}), **error.headers},
+        headers={"Cache-Control": "no-store", **error.headers},
     )
     response.code = error.code
     return response
