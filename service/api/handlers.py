@@ -52,17 +52,13 @@ def _translated(request: Request, exc: Exception) -> CamindError:
     if exc.status_code == 404:
         return NotFound(f"There is nothing at {request.url.path[:200]}: GET /docs lists what there is.")
     if exc.status_code == 405:
-        allow = allowed_methods(request)
+        allow = tuple(_allowed(request))
         return MethodNotAllowed(f"This path answers {', '.join(allow)}.", allow=allow)
     return BadRequest("The body cannot be read: send it whole, in the form its Content-Type names.")
 
 
-def allowed_methods(request: Request) -> tuple[str, ...]:
-    """The methods that the path's routes answer, over all of them."""
-    return tuple(_allowed(request))
-
-
 def _allowed(request: Request) -> Iterator[str]:
+    """The methods that the path's routes answer, over all of them."""
     for method in METHODS:
         scope = {**request.scope, "method": method}
         if any(route.matches(dict(scope))[0] is Match.FULL for route in request.app.router.routes):
