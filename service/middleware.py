@@ -56,7 +56,7 @@ class ObserveRequests:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        exchange = _Exchange(_request_id(scope))
+        exchange = _Exchange(request_id_of(Headers(scope=scope)))
 
         async def stamped(message: Message) -> None:
             exchange.stamp(message)
@@ -194,8 +194,9 @@ def _too_large(limit: int) -> TooLarge:
     return TooLarge(f"The request body may have at most {limit} bytes.")
 
 
-def _request_id(scope: Scope) -> str:
-    given = Headers(scope=scope).get(REQUEST_ID, "")
+def request_id_of(headers: Headers) -> str:
+    """The id that a request came with, or a new one."""
+    given = headers.get(REQUEST_ID, "")
     return given if SANE_REQUEST_ID.fullmatch(given) else uuid4().hex
 
 

@@ -5,11 +5,10 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import cast
-from uuid import uuid4
 
 import h11
 import structlog
@@ -22,7 +21,7 @@ from service.api.problems import PROBLEM_TYPE, problem
 from service.config import Settings
 from service.errors import BadRequest, CamindError, ReceiveTimeout
 from service.memory import keep_freed_memory
-from service.middleware import REQUEST_ID, SANE_REQUEST_ID
+from service.middleware import REQUEST_ID, request_id_of
 
 GRACE_S = 1.0
 BACKLOG = 2048
@@ -146,7 +145,7 @@ class DeadlineProtocol(H11Protocol):
         """Answer and close; what still comes is thrown away for a moment, for a reset would take the answer along."""
         self.count_problem(error.code)
         request = self.scope if self.conn.our_state is h11.SEND_RESPONSE else None
-        request_id = _request_id(request["headers"] if request else ())
+        request_id = request_id_of(Headers(raw=list(request["headers"]) if request else []))
         is_answered = self.conn.our_state not in UNANSWERED
         log.info("refused", request_id=request_id, status=None if is_answered else error.status, problem=error.code)
         body = problem(error).model_dump_json(exclude_none=True).encode()
@@ -202,12 +201,6 @@ class StoppingServer(uvicorn.Server):
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         await asyncio.sleep(self._drain_s)
         await super().shutdown(sockets)
-
-
-def _request_id(headers: Iterable[tuple[bytes, bytes]]) -> str:
-    """The id that a request came with, or a new one."""
-    given = Headers(raw=list(headers)).get(REQUEST_ID, "")
-    return given if SANE_REQUEST_ID.fullmatch(given) else uuid4().hex
 
 
 def bind(host: str, port: int) -> socket.socket:
