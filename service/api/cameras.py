@@ -7,7 +7,7 @@ from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
 from service.api.cursors import Cursor, Limit, cursor_after, name_of
-from service.api.dependencies import CamerasDep, IdempotencyKey, SettingsDep, require_json
+from service.api.dependencies import CamerasDep, IdempotencyKey, require_json
 from service.api.problems import STORE_ERRORS, WRITE_ERRORS, responses
 from service.api.schemas import (
     CameraCreate,
@@ -106,9 +106,9 @@ def list_cameras(
     responses=responses(BadRequest, InvalidImage, TooLarge, UnsupportedKind, Busy),
     openapi_extra={"requestBody": REQUEST_BODY},
 )
-async def draft_camera_from_photo(request: Request, settings: SettingsDep) -> CameraDraftRead:
+async def draft_camera_from_photo(request: Request) -> CameraDraftRead:
     """What the photograph's EXIF tells of the camera that took it; nothing is stored, of either."""
-    upload = await receive_photograph(request, settings.max_image_bytes)
+    upload = await receive_photograph(request)
     return CameraDraftRead.model_validate(await run_in_threadpool(_drafted, upload.data), from_attributes=True)
 
 

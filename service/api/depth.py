@@ -83,7 +83,7 @@ async def estimate_depth(
     pixel is NaN, in png 0.
     """
     chosen = choose_format(query.format, request.headers.get("accept"), FORMAT_TYPES)
-    upload = await receive_photograph(request, settings.max_image_bytes)
+    upload = await receive_photograph(request)
     record = await run_in_threadpool(cameras.get, query.camera)
     order = Order.of(upload, record, query, (chosen,), ImageLimits.of(settings))
     outcome = await unless_gone(request, worker.run(fulfil, order, estimator))

@@ -47,7 +47,7 @@ async def preview_photograph(
     longest_px: Annotated[int, Query(ge=16, le=4096, description="Its longer side at most")] = 1600,
 ) -> Response:
     """What HEIC and raw files show, for browsers that do not read them. Nothing is stored."""
-    upload = await receive_photograph(request, settings.max_image_bytes)
+    upload = await receive_photograph(request)
     order = Order(upload, longest_px, ImageLimits.of(settings))
     encoded = (await unless_gone(request, worker.run(fulfil, order))).value
     return Response(encoded.body, media_type=encoded.media_type)

@@ -1,5 +1,9 @@
-"""One photograph out of a request: the raw body, or a multipart field; never more bytes than allowed."""
+"""One photograph out of a request: the raw body, or a multipart field.
 
+How large a body may be is for ``LimitRequests``, in front of every route, to say.
+"""
+
+import sys
 from collections.abc import AsyncGenerator, Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -8,7 +12,7 @@ from fastapi import Request
 from starlette.datastructures import UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 
-from service.errors import BadRequest, Busy, FieldProblem, TooLarge
+from service.errors import BadRequest, Busy, FieldProblem
 from service.inference.images import MEDIA_TYPES, declared_kind
 
 FIELD = "image"
@@ -31,8 +35,6 @@ REQUEST_BODY = {
         },
     },
 }
-# boundaries and part headers around the picture
-MULTIPART_OVERHEAD_BYTES = 16_384
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,27 +73,26 @@ class Arrivals:
             self._held_bytes -= own_bytes
 
 
-async def receive_photograph(request: Request, max_bytes: int) -> Upload:
+async def receive_photograph(request: Request) -> Upload:
     """The photograph of a request.
 
-    Raises ``TooLarge``, ``UnsupportedKind`` (a declared type that is not listed), ``BadRequest`` (a form without the
-    field, or with others) and ``Busy`` (too much arrives at once).
+    Raises ``UnsupportedKind`` (a declared type that is not listed), ``BadRequest`` (a form without the field, or with
+    others) and ``Busy`` (too much arrives at once).
     """
     media_type = request.headers.get("content-type")
     arrivals: Arrivals = request.app.state.arrivals
     with arrivals.counted() as take:
         if media_type is not None and media_type.lower().startswith(MULTIPART):
-            return await _from_form(request, max_bytes, take)
+            return await _from_form(request, take)
         declared_kind(media_type)
-        chunks = [chunk async for chunk in _bounded(request, max_bytes, take)]
+        chunks = [chunk async for chunk in _taken(request, take)]
         return Upload(b"".join(chunks), media_type)
 
 
-async def _from_form(request: Request, max_bytes: int, take: Callable[[int], None]) -> Upload:
-    stream = _bounded(request, max_bytes + MULTIPART_OVERHEAD_BYTES, take)
-    parser = MultiPartParser(request.headers, stream, max_files=1, max_fields=1)
+async def _from_form(request: Request, take: Callable[[int], None]) -> Upload:
+    parser = MultiPartParser(request.headers, _taken(request, take), max_files=1, max_fields=1)
     # photographs for depth are never written to a disk, not even to an unnamed file
-    parser.spool_max_size = max_bytes + MULTIPART_OVERHEAD_BYTES
+    parser.spool_max_size = sys.maxsize
     try:
         form = await parser.parse()
     except (MultiPartException, KeyError, ValueError) as exc:  # ValueError: of a charset that decodes nothing
@@ -108,19 +109,8 @@ async def _from_form(request: Request, max_bytes: int, take: Callable[[int], Non
         await form.close()
 
 
-async def _bounded(request: Request, max_bytes: int, take: Callable[[int], None]) -> AsyncGenerator[bytes, None]:
-    """The body in chunks, each counted; ``TooLarge`` by its stated length before the first, by its true one after."""
-    stated = request.headers.get("content-length", "")
-    if stated.isdecimal() and int(stated) > max_bytes:
-        raise _too_large(max_bytes)
-    received = 0
+async def _taken(request: Request, take: Callable[[int], None]) -> AsyncGenerator[bytes, None]:
+    """The body in chunks, each counted."""
     async for chunk in request.stream():
-        received += len(chunk)
-        if received > max_bytes:
-            raise _too_large(max_bytes)
         take(len(chunk))
         yield chunk
-
-
-def _too_large(max_bytes: int) -> TooLarge:
-    return TooLarge(f"The request body may have at most {max_bytes} bytes.")
