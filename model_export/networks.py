@@ -11,7 +11,6 @@ import itertools
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor, nn
@@ -91,14 +90,6 @@ def _widths_of(network: str, weights: Mapping[str, Tensor]) -> tuple[int, ...]:
 
 
 SHIPPED_WIDTHS = Widths()
-
-
-class BlurNetwork(Protocol):
-    def __call__(self, image: Tensor) -> BlurEstimate: ...
-
-
-class DepthNetwork(Protocol):
-    def __call__(self, defocus: Tensor, spread: Tensor, scene: Scene, features: Features) -> DepthEstimate: ...
 
 
 def _gaussian(sigma: float, radius: int) -> Tensor:
