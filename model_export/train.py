@@ -19,7 +19,6 @@ from queue import Queue
 from threading import Event, Thread, current_thread, main_thread
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from rich.console import Console
@@ -28,7 +27,7 @@ from torch.nn.utils import convert_conv2d_weight_memory_format
 from torch.utils.data import DataLoader, Dataset
 
 from model_export.config import MOST_SEED, Kind, Learning, SceneConfig, TrainConfig
-from model_export.cores import computes_bfloat16, sent, torch_threads
+from model_export.cores import computes_bfloat16, one_core, sent, torch_threads
 from model_export.darkroom import photograph
 from model_export.folded import folded
 from model_export.frames import load_frames
@@ -74,8 +73,7 @@ class SceneStream(Dataset[Drawn]):
 
 
 def _worker_start(_: int) -> None:
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
+    one_core()
     os.nice(19)  # steps come first where cores are shared
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever stops a run stops its steps, which then save what they did
 
