@@ -310,18 +310,17 @@ def _strips(shown: NDArray[np.bool_], lit: NDArray[np.bool_], axis: int, reach: 
     return slice(low, high), slice(start, start + length)
 
 
-def refocus(
-    image: NDArray[np.float32], depth_m: NDArray[np.float32], camera: Camera, spread: PointSpread = DISC
-) -> NDArray[np.float32]:
+def refocus(image: NDArray[np.float32], depth_m: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
     """The picture [h,w,3] in 0..1 (sRGB) that ``camera`` would take of a sharp RGB picture with depth [h,w].
 
     ``depth_m`` is finite and positive everywhere. Depth is sliced; each slice is continued behind what is
     nearer, with the nearest colour of its own or farther slices, so background shows behind a blurred
-    edge. gamma is applied to the whole picture, less the pixel's own box which the input has already.
+    edge. The lens blurs by discs; gamma is applied to the whole picture, less the pixel's own box which the input has
+    already.
     """
     signed = thin_lens.signed_defocus(depth_m, camera.focus_distance_m) * camera.k_cam_px
     sigma = thin_lens.defocus_at_depth(depth_m, camera.focus_distance_m, camera.k_cam_px)
-    margin = math.ceil(spread.reach_px(float(sigma.max())) + GAUSSIAN.reach_px(camera.gamma_px)) + 1
+    margin = math.ceil(DISC.reach_px(float(sigma.max())) + GAUSSIAN.reach_px(camera.gamma_px)) + 1
     margin = min(margin, min(depth_m.shape) - 1)
     height, width = depth_m.shape
     pad = tuple((margin, cv2.getOptimalDFTSize(size + 2 * margin) - size - margin) for size in (height, width))
@@ -334,12 +333,12 @@ def refocus(
     reach = 0
     for number, level in enumerate(levels):
         # what is hidden may be seen as far as anything nearer is blurred
-        reach = max(reach, math.ceil(spread.reach_px(level)))
+        reach = max(reach, math.ceil(DISC.reach_px(level)))
         shown, lit = index <= number, clear[0].abs().numpy() > UNSEEN
         if not lit.any():
             break
         place, source = zip(*(_strips(shown, lit, axis, reach) for axis in (0, 1)), strict=True)
-        blurred = blur(torch.cat(_slice(linear[source], index[source], number)), level, spread)
+        blurred = blur(torch.cat(_slice(linear[source], index[source], number)), level, DISC)
         own = tuple(slice(to.start - cut.start, to.stop - cut.start) for to, cut in zip(place, source, strict=True))
         color, alpha = blurred[(slice(3), *own)], blurred[(slice(3, 4), *own)]
         within = (slice(None), *place)
