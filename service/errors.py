@@ -26,7 +26,7 @@ Domain code raises these and knows no HTTP beyond the class; one handler turns t
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Self
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +48,11 @@ class CamindError(Exception):
         super().__init__(detail)
         self.detail = detail
         self.errors = errors
+
+    @classmethod
+    def at(cls, detail: str, *pointers: str) -> Self:
+        """The error as a fault at each of these places."""
+        return cls(detail, errors=tuple(FieldProblem(pointer, detail) for pointer in pointers))
 
     @property
     def headers(self) -> dict[str, str]:

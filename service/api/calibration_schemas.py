@@ -13,7 +13,7 @@ from service.calibration.edge import Shape
 from service.calibration.look import Exposure, Look
 from service.calibration.report import Method, Role
 from service.calibration.target import CircleGrid, Kind
-from service.errors import BadRequest, FieldProblem
+from service.errors import BadRequest
 from service.storage.calibrations import CalibrationRecord, CalibrationSummary
 
 SETTINGS_FIELD = "settings"
@@ -89,7 +89,8 @@ class CalibrationSettings(Given):
             raise invalid_request([_in_field(dict(fault)) for fault in exc.errors()]) from exc
         settings.to_grid()
         if settings.method == "paper" and settings.focus_distance_m is None:
-            raise _fault("focus_distance_m", "The paper's method needs the focus distance: it cannot find it.")
+            detail = "The paper's method needs the focus distance: it cannot find it."
+            raise BadRequest.at(detail, f"#/{SETTINGS_FIELD}/focus_distance_m")
         return settings
 
     def to_grid(self) -> CircleGrid:
@@ -98,7 +99,8 @@ class CalibrationSettings(Given):
         try:
             return CircleGrid(given.kind, given.rows, given.columns, given.spacing_mm, given.diameter_mm)
         except ValueError as exc:
-            raise _fault("pattern/diameter_mm", f"No such grid can be printed: {exc}.") from exc
+            detail = f"No such grid can be printed: {exc}."
+            raise BadRequest.at(detail, f"#/{SETTINGS_FIELD}/pattern/diameter_mm") from exc
 
 
 class Acceptance(Given):
@@ -266,7 +268,3 @@ def _in_field(fault: dict[str, object]) -> dict[str, object]:
     # JSON that is none has its place in its message: elsewhere it would point to the whole body
     kind = "json" if fault["type"] == "json_invalid" else fault["type"]
     return {**fault, "type": kind, "loc": ("body", SETTINGS_FIELD, *path)}
-
-
-def _fault(place: str, detail: str) -> BadRequest:
-    return BadRequest(detail, errors=(FieldProblem(f"#/{SETTINGS_FIELD}/{place}", detail),))

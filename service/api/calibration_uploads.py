@@ -16,7 +16,7 @@ from python_multipart.multipart import parse_options_header
 from service.api.calibration_schemas import SETTINGS_FIELD
 from service.api.problems import invalid_request
 from service.api.uploads import MULTIPART
-from service.errors import BadRequest, FieldProblem, InvalidImage, TooLarge, UnsupportedKind
+from service.errors import BadRequest, InvalidImage, TooLarge, UnsupportedKind
 from service.inference.headers import sniff
 from service.storage.calibrations import StoredPicture
 from service.storage.disk import storing, write_through
@@ -135,7 +135,7 @@ class _Parts:
                 raise invalid_request([{"type": "missing", "loc": ("body", name), "msg": "Field required"}])
         if not self._has_photograph:
             detail = "None of these files is a photograph: send JPEG, PNG, TIFF, WebP, HEIC or DNG."
-            raise InvalidImage(detail, errors=(FieldProblem(f"#/{DEFOCUSED}", detail),))
+            raise InvalidImage.at(detail, f"#/{DEFOCUSED}")
         return Form(bytes(self._settings or b""), tuple(self._pictures))
 
     def close(self) -> None:
@@ -171,8 +171,7 @@ class _Parts:
         elif part.role in ROLES:
             part.file = (self._folder / picture_file(len(self._pictures))).open("wb")
         elif part.role == SETTINGS_FIELD:
-            detail = "Send the settings once."
-            raise BadRequest(detail, errors=(FieldProblem(f"#/{SETTINGS_FIELD}", detail),))
+            raise BadRequest.at("Send the settings once.", f"#/{SETTINGS_FIELD}")
         else:
             raise invalid_request([{"type": "extra_forbidden", "loc": ("body", part.role), "msg": ""}])
 
@@ -186,7 +185,7 @@ class _Parts:
             raise self._too_many()
         if part.size_bytes > self._limits.max_picture_bytes:
             detail = f"A photograph may have at most {self._limits.max_picture_bytes} bytes."
-            raise TooLarge(detail, errors=(FieldProblem(f"#/{part.role}", detail),))
+            raise TooLarge.at(detail, f"#/{part.role}")
         if len(part.magic) < MAGIC_BYTES:
             part.magic += data[start : min(end, start + MAGIC_BYTES)]
         part.file.write(data[start:end])

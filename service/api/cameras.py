@@ -25,7 +25,6 @@ from service.errors import (
     BadRequest,
     Busy,
     Conflict,
-    FieldProblem,
     InvalidImage,
     KeyReused,
     NotFound,
@@ -220,8 +219,7 @@ def read_curve(
     near = near_m if near_m is not None else min(focus_m, far_m or focus_m) / CURVE_SPAN
     far = far_m if far_m is not None else max(focus_m, near_m or focus_m) * CURVE_SPAN
     if near >= far:
-        detail = "near_m must be smaller than far_m."
-        raise BadRequest(detail, errors=(FieldProblem("near_m", detail), FieldProblem("far_m", detail)))
+        raise BadRequest.at("near_m must be smaller than far_m.", "near_m", "far_m")
     return CurveRead(
         camera=record.name,
         revision=record.revision,

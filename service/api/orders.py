@@ -6,7 +6,7 @@ from typing import Self
 
 from service.api.depth_schemas import DepthQuery, DepthRead, PointRead, SpreadRead
 from service.api.uploads import Upload
-from service.errors import BadRequest, FieldProblem
+from service.errors import BadRequest
 from service.inference.cancellation import Cancellation
 from service.inference.depth_map import DepthMap
 from service.inference.encode import ENCODERS, MEDIA_TYPES, Encoded, pixel_at, read_point, spread_of
@@ -107,8 +107,7 @@ def _focused(camera: Camera, focus_distance_m: float | None) -> tuple[Camera, tu
     try:
         focused = camera.focused_at(focus_distance_m)
     except ValueError as exc:
-        detail = f"The camera cannot focus at {focus_distance_m:g} m: {exc}."
-        raise BadRequest(detail, errors=(FieldProblem("focus_distance_m", detail),)) from exc
+        raise BadRequest.at(f"The camera cannot focus at {focus_distance_m:g} m: {exc}.", "focus_distance_m") from exc
     if camera.focal_length_m is None:
         return focused, ("The lens' focal length is unknown and was taken as far below the focus distance.",)
     return focused, ()

@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from service.api.cursors import NextCursor
 from service.api.texts import Worded
-from service.errors import BadRequest, FieldProblem
+from service.errors import BadRequest
 from service.optics.camera import Camera, Intrinsics, Lens
 from service.storage.cameras import DEFAULT_K_R, NAME_PATTERN, CameraDraft, CameraRecord, Source
 
@@ -78,7 +78,8 @@ class PinholeIntrinsics(Given):
     def to_domain(self) -> Intrinsics:
         """The intrinsics as the physics takes them; ``BadRequest`` for a count OpenCV does not know."""
         if len(self.distortion) not in DISTORTION_LENGTHS:
-            raise _fault("#/intrinsics/distortion", "Send 0, 4, 5, 8, 12 or 14 coefficients, in OpenCV's order.")
+            detail = "Send 0, 4, 5, 8, 12 or 14 coefficients, in OpenCV's order."
+            raise BadRequest.at(detail, "#/intrinsics/distortion")
         return Intrinsics(self.fx_px, self.fy_px, self.cx_px, self.cy_px, tuple(self.distortion))
 
 
@@ -134,7 +135,7 @@ class CameraSpecs(Given):
                 intrinsics=intrinsics,
             )
         except (ValueError, ArithmeticError) as exc:
-            raise _fault("#", f"No camera has these numbers: {exc}.") from exc
+            raise BadRequest.at(f"No camera has these numbers: {exc}.", "#") from exc
 
     def to_draft(self, name: str) -> CameraDraft:
         """The camera under a name, with what it was made from."""
@@ -147,13 +148,12 @@ class CameraSpecs(Given):
             return self.k_cam_px
         if lens is None or self.k_cam_px is not None:
             both = "not both" if lens else "one of them is needed"
-            detail = f"Send exactly one of k_cam_px and lens, {both}."
-            raise BadRequest(detail, errors=(FieldProblem("#/k_cam_px", detail), FieldProblem("#/lens", detail)))
+            raise BadRequest.at(f"Send exactly one of k_cam_px and lens, {both}.", "#/k_cam_px", "#/lens")
         if lens.focal_length_m >= self.focus_distance_m:
-            raise _fault(
-                "#/lens/focal_length_mm",
+            raise BadRequest.at(
                 f"A lens of {lens.focal_length_mm:g} mm cannot focus at {self.focus_distance_m:g} m: "
                 "the focal length must be shorter than the focus distance.",
+                "#/lens/focal_length_mm",
             )
         return lens.k_cam_px(self.focus_distance_m, self.image_width_px)
 
@@ -224,7 +224,7 @@ class CameraReplace(CameraSpecs):
     def to_named_draft(self, name: str) -> CameraDraft:
         """The draft for the camera in the URL; ``BadRequest`` where the body names another."""
         if self.name is not None and self.name != name:
-            raise _fault("#/name", "The name differs from the URL's: a camera cannot be renamed.")
+            raise BadRequest.at("The name differs from the URL's: a camera cannot be renamed.", "#/name")
         return self.to_draft(name)
 
 
@@ -365,10 +365,6 @@ class CurveRead(BaseModel):
     revision: int
     focus_distance_m: float
     points: list[CurvePoint]
-
-
-def _fault(pointer: str, detail: str) -> BadRequest:
-    return BadRequest(detail, errors=(FieldProblem(pointer, detail),))
 
 
 def _fx_px(draft: CameraDraft) -> float | None:

@@ -6,7 +6,7 @@ from fastapi import APIRouter, Depends, Query, Response
 
 from service.api.problems import responses
 from service.calibration.target import CircleGrid, Kind, Paper, Sheet, as_pdf, as_svg, lay_out
-from service.errors import BadRequest, FieldProblem
+from service.errors import BadRequest
 
 MOST_CIRCLES = 40
 
@@ -68,4 +68,4 @@ def read_target_pdf(sheet: SheetDep) -> Response:
 
 
 def _misfit(cause: ValueError) -> BadRequest:
-    return BadRequest(str(cause), errors=(FieldProblem("spacing_mm", str(cause)),))
+    return BadRequest.at(str(cause), "spacing_mm")

@@ -12,7 +12,7 @@ from fastapi import Request
 from starlette.datastructures import UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 
-from service.errors import BadRequest, Busy, FieldProblem
+from service.errors import BadRequest, Busy
 from service.inference.images import MEDIA_TYPES, declared_kind
 
 FIELD = "image"
@@ -97,12 +97,11 @@ async def _from_form(request: Request, take: Callable[[int], None]) -> Upload:
         form = await parser.parse()
     except (MultiPartException, KeyError, ValueError) as exc:  # ValueError: of a charset that decodes nothing
         detail = f"The form cannot be read ({exc}): send one file in the field '{FIELD}'."
-        raise BadRequest(detail, errors=(FieldProblem(f"#/{FIELD}", detail),)) from exc
+        raise BadRequest.at(detail, f"#/{FIELD}") from exc
     try:
         file = form.get(FIELD)
         if not isinstance(file, UploadFile) or len(form.multi_items()) != 1:
-            detail = f"Send one file in the field '{FIELD}', and no other field."
-            raise BadRequest(detail, errors=(FieldProblem(f"#/{FIELD}", detail),))
+            raise BadRequest.at(f"Send one file in the field '{FIELD}', and no other field.", f"#/{FIELD}")
         declared_kind(file.content_type)
         return Upload(await file.read(), file.content_type)
     finally:

@@ -13,7 +13,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from service.errors import BadRequest, FieldProblem
+from service.errors import BadRequest
 from service.inference.depth_map import DepthMap
 from service.inference.part import Part
 from service.inference.png import grey_png
@@ -127,7 +127,7 @@ def encode_ply(answer: DepthMap, rgb: NDArray[np.uint8]) -> Encoded:
     matrix = camera_matrix(answer)
     if not np.isfinite(matrix).all():
         detail = "A point cloud needs the camera's focal length: register it with intrinsics or lens."
-        raise BadRequest(detail, errors=(FieldProblem("format", detail),))
+        raise BadRequest.at(detail, "format")
     v, u = np.nonzero(answer.valid)
     is_met = _is_met(answer)[v // LENS_CELL_PX, u // LENS_CELL_PX]
     v, u = v[is_met], u[is_met]
@@ -245,7 +245,7 @@ def pixel_at(u: float, v: float, part: Part, asked_in: str = "at") -> tuple[int,
     if not (0 <= row < part.height_px and 0 <= column < part.width_px):
         asked = f"({part.left}, {part.top}) to ({part.right}, {part.bottom})"
         detail = f"({u:g}, {v:g}) lies outside what is asked for of the upright photograph, {asked}."
-        raise BadRequest(detail, errors=(FieldProblem(asked_in, detail),))
+        raise BadRequest.at(detail, asked_in)
     return row, column
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from service.errors import BadRequest, FieldProblem
+from service.errors import BadRequest
 from service.optics.camera import Camera
 
 
@@ -45,11 +45,11 @@ class Part:
     def require_within(self, width_px: int, height_px: int) -> None:
         """Raises ``BadRequest`` where it is empty or leaves a photograph of that size."""
         if not (0 <= self.left < self.right <= width_px and 0 <= self.top < self.bottom <= height_px):
-            detail = (
+            raise BadRequest.at(
                 f"({self.left}, {self.top}) to ({self.right}, {self.bottom}) is no part of the upright photograph of "
-                f"{width_px}x{height_px} pixels."
+                f"{width_px}x{height_px} pixels.",
+                "roi",
             )
-            raise BadRequest(detail, errors=(FieldProblem("roi", detail),))
 
     def widened(self, margin_px: int, multiple: int, width_px: int, height_px: int) -> "Part":
         """The part with a margin on every side, as far as the photograph goes, from multiples."""

@@ -15,7 +15,7 @@ from sqlalchemy.exc import IntegrityError
 from sqlmodel import Session, col, select
 from sqlmodel.sql.expression import Select
 
-from service.errors import BadRequest, Conflict, FieldProblem, NotFound, PreconditionFailed
+from service.errors import BadRequest, Conflict, NotFound, PreconditionFailed
 from service.optics.camera import Camera, Intrinsics, Lens
 from service.principal import LOCAL
 from service.storage.engine import reading, writing
@@ -176,8 +176,7 @@ def store_calibrated(session: Session, owner: str, name: str, camera: Camera) ->
 
 
 def _taken(name: str) -> Conflict:
-    detail = f"A camera '{name}' exists already: replace it with PUT /cameras/{name}."
-    return Conflict(detail, errors=(FieldProblem("#/name", detail),))
+    return Conflict.at(f"A camera '{name}' exists already: replace it with PUT /cameras/{name}.", "#/name")
 
 
 def _unknown(name: str) -> NotFound:
