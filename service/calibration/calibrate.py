@@ -110,7 +110,7 @@ def _partner(picture: Picture, measured: list[Measured]) -> Measured | None:
     return focused[place_] if place_ < len(focused) else None
 
 
-def _measured(task: Task, picture: Picture, at: Callable[[float], None], partner: Measured | None = None) -> Measured:
+def _measured(task: Task, picture: Picture, at: Callable[[float], None], partner: Measured | None) -> Measured:
     out = Measured(PictureReport(picture.name, picture.role, found=False))
     try:
         rgb = picture.load()

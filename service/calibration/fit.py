@@ -124,14 +124,13 @@ def fit_constants(
     *,
     depth_error: float = 0.0,
     resamples: int = RESAMPLES,
-    seed: int = 0,
     tick: Callable[[], None] = lambda: None,
 ) -> Constants:
     """The constants with 95 % intervals by a bootstrap over pictures; the focus distance is fitted unless given.
 
     ``depth_error`` is the relative standard error that all depths have in common, as from the focal length; without
-    ``resamples`` the intervals have no width. ``tick`` is called now and then. Raises
-    ``FitError`` for fewer than four circles or for circles that show no blur by defocus.
+    ``resamples`` the intervals have no width. ``tick`` is called now and then. Raises ``FitError`` for fewer than four
+    circles or for circles that show no blur by defocus.
     """
     defocused = ~circles.is_focused
     if defocused.sum() < LEAST_CIRCLES:
@@ -143,8 +142,8 @@ def fit_constants(
 
     doubt = None
     if focus_distance_m is not None:
-        doubt = _doubt(circles, focus_distance_m, partial(fit_at, None), depth_error, seed)
-    found = _constants(circles, partial(fit_at, focus_distance_m), focus_distance_m, depth_error, resamples, seed)
+        doubt = _doubt(circles, focus_distance_m, partial(fit_at, None), depth_error)
+    found = _constants(circles, partial(fit_at, focus_distance_m), focus_distance_m, depth_error, resamples)
     if doubt is None:
         return found
     told, is_sure = doubt
@@ -153,7 +152,7 @@ def fit_constants(
     return replace(found, warnings=(told, *found.warnings))
 
 
-def _doubt(circles: Circles, given_m: float, fit: Fit, depth_error: float, seed: int) -> tuple[str, bool] | None:
+def _doubt(circles: Circles, given_m: float, fit: Fit, depth_error: float) -> tuple[str, bool] | None:
     """What circles say against a focus distance that was given, and whether they are sure: on both sides of it.
 
     ``FitError`` where they are, and it is quite another. On one side alone they may tell it none the less; where they
@@ -162,7 +161,7 @@ def _doubt(circles: Circles, given_m: float, fit: Fit, depth_error: float, seed:
     best = fit(circles, None)
     depth_m = circles.depth_m[~circles.is_focused]
     is_sure = bool(depth_m.min() < best[2] < depth_m.max())
-    drawn = _resampled(circles, fit, best, None, depth_error, CHECKS, seed)
+    drawn = _resampled(circles, fit, best, None, depth_error, CHECKS)
     k_cam, own = (_interval(best[i], drawn[:, i], _widening(circles)) for i in (0, 2))
     if max(k_cam.relative_width, own.relative_width) >= LOOSE:
         return None if is_sure else (UNCHECKED, False)
@@ -189,14 +188,7 @@ def odd_pictures(circles: Circles, constants: Constants) -> list[int]:
     ]
 
 
-def fit_as_paper(
-    circles: Circles,
-    focus_distance_m: float,
-    *,
-    depth_error: float = 0.0,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
-) -> Constants:
+def fit_as_paper(circles: Circles, focus_distance_m: float, *, depth_error: float, resamples: int) -> Constants:
     """The paper's procedure: gamma from the focused pictures, k_cam of each defocused circle, outliers out, median.
 
     Raises ``FitError`` without focused and defocused circles.
@@ -215,7 +207,7 @@ def fit_as_paper(
         kept = k_cam[(k_cam >= low - FENCE * (high - low)) & (k_cam <= high + FENCE * (high - low))]
         return np.array([float(np.median(kept)), gamma, focus_distance_m])
 
-    return _constants(circles, fit, focus_distance_m, depth_error, resamples, seed)
+    return _constants(circles, fit, focus_distance_m, depth_error, resamples)
 
 
 def per_circle_k_cam(circles: Circles, gamma_px: float, focus_m: float) -> Array:
@@ -226,14 +218,7 @@ def per_circle_k_cam(circles: Circles, gamma_px: float, focus_m: float) -> Array
     return np.where(says, sigma / np.maximum(excess, LEAST_EXCESS), np.nan)
 
 
-def _constants(
-    circles: Circles,
-    fit: Fit,
-    focus_m: float | None,
-    depth_error: float,
-    resamples: int,
-    seed: int,
-) -> Constants:
+def _constants(circles: Circles, fit: Fit, focus_m: float | None, depth_error: float, resamples: int) -> Constants:
     best = fit(circles, None)
     if not best[0] * circles.excess(best[2]).max() > MUST_SHOW * best[1]:
         raise FitError(
@@ -242,7 +227,7 @@ def _constants(
         )
     rest = _left_over(best, circles)
     scale = max(1.4826 * float(np.median(np.abs(rest))), 1e-6)
-    drawn = _resampled(circles, fit, best, focus_m, depth_error, resamples, seed) if resamples else best[None]
+    drawn = _resampled(circles, fit, best, focus_m, depth_error, resamples) if resamples else best[None]
     widen = _widening(circles)
     k_cam, gamma, focus = (_interval(best[i], drawn[:, i], widen) for i in range(3))
     return Constants(
@@ -299,21 +284,13 @@ def _start(circles: Circles, focus_m: float) -> Array:
     return np.array([max(k_cam, 2 * K_CAM_BOUNDS_PX[0]), gamma, focus_m])
 
 
-def _resampled(
-    circles: Circles,
-    fit: Fit,
-    best: Array,
-    focus_m: float | None,
-    depth_error: float,
-    count: int,
-    seed: int,
-) -> Array:
-    """Constants [count, 3] of pictures drawn with replacement (of circles, if there is one).
+def _resampled(circles: Circles, fit: Fit, best: Array, focus_m: float | None, depth_error: float, count: int) -> Array:
+    """Constants [count, 3] of pictures drawn with replacement (of circles, if there is one), always the same.
 
     What all pictures have in common no drawing shows: depths and blur are in doubt alike, gamma by what cannot be told
     from the pixel itself, and the focus distance unless it is given.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     focus_error = 0.0 if focus_m is not None else FOCUS_ERROR
     labels = np.unique(circles.picture)
     groups = [np.flatnonzero(circles.picture == label) for label in labels]
