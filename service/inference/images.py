@@ -72,13 +72,11 @@ class ImageLimits:
 
 @dataclass(frozen=True, slots=True)
 class Photograph:
-    """``rgb``: uint8 [height, width, 3], sRGB, upright. The stored size is that before orientation."""
+    """``rgb``: uint8 [height, width, 3], sRGB, upright; ``orientation`` is the EXIF's of the file, 1..8."""
 
     rgb: NDArray[np.uint8]
     kind: Kind
     orientation: int
-    stored_width_px: int
-    stored_height_px: int
     warnings: tuple[str, ...] = ()
     shot: Shot = field(default_factory=Shot)
 
@@ -108,9 +106,7 @@ def read_photograph(data: bytes, media_type: str | None = None, limits: ImageLim
     warnings: tuple[str, ...] = (f"declared {media_type}, read as {kind}",) if declared not in (None, kind) else ()
     if header.has_more:
         warnings += ("the file has more than one picture: the first was read",)
-    height, width = stored.shape[:2]
-    upright = turned(stored, orientation)
-    return Photograph(upright, kind, orientation, width, height, warnings, read_shot(header.exif))
+    return Photograph(turned(stored, orientation), kind, orientation, warnings, read_shot(header.exif))
 
 
 def read_stored_frame(data: bytes, limits: ImageLimits | None = None) -> NDArray[np.uint8]:

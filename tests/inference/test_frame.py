@@ -20,7 +20,7 @@ CAMERA = Camera(640, 480, 2.0, 6.0, 0.5, intrinsics=INTRINSICS)
 def photograph(width: int, height: int, orientation: int = 1) -> Photograph:
     """Stored width x height, turned upright."""
     rgb = np.zeros((height, width, 3), np.uint8)
-    return Photograph(turned(rgb, orientation), "jpeg", orientation, width, height)
+    return Photograph(turned(rgb, orientation), "jpeg", orientation)
 
 
 def projected(intrinsics: Intrinsics, points: NDArray[np.float64]) -> NDArray[np.float64]:

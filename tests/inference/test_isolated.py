@@ -74,7 +74,6 @@ def near(found: object, wanted: object) -> None:
 def test_a_heic_is_turned_exactly_once(orientation: int) -> None:
     photograph = read_photograph(heic(*HEIC_TURNS[orientation]), "image/heic")
     assert (photograph.kind, photograph.orientation, photograph.warnings) == ("heic", orientation, ())
-    assert (photograph.stored_width_px, photograph.stored_height_px) == (64, 48)
     near(photograph.rgb, turned(corners(), orientation))
 
 
