@@ -2,12 +2,11 @@
 
 from service.errors import ImageSizeMismatch
 from service.inference.headers import Shot
-from service.inference.images import TURNS, Photograph
+from service.inference.images import TURNS, UNTURNS, Photograph
 from service.optics.camera import Camera, Lens
 
 LENS_TOLERANCE = 0.05
 MOST_ZOOM = 1.01
-UNTURNS = {orientation: {6: 8, 8: 6}.get(orientation, orientation) for orientation in TURNS}
 
 
 def stored_camera_of(camera: Camera, width_px: int, height_px: int, orientation: int) -> Camera | None:

@@ -52,6 +52,8 @@ TURNS: dict[int, tuple[bool, bool, bool]] = {
     7: (True, True, True),
     8: (True, False, True),
 }
+# the orientation that undoes each
+UNTURNS = {orientation: {6: 8, 8: 6}.get(orientation, orientation) for orientation in TURNS}
 # not IMREAD_COLOR_RGB: OpenCV 5.0 leaves a 16-bit TIFF read so uninitialised
 DECODE_FLAGS = cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
@@ -196,7 +198,7 @@ def _eight_bits(pixels: NDArray[Any]) -> NDArray[np.uint8]:
 
 def _unturned_pixels(upright: NDArray[np.uint8], header: Header) -> NDArray[np.uint8]:
     """The stored frame of a HEIC, whose decoder turns it."""
-    stored = turned(upright, {6: 8, 8: 6}.get(header.orientation, header.orientation))
+    stored = turned(upright, UNTURNS[header.orientation])
     if stored.shape[:2] != (header.height_px, header.width_px):
         raise InvalidImage("The heic file's picture is not of the size that it states.")
     return stored
