@@ -52,7 +52,7 @@ class Authenticate:
     another name than ``hosts`` and those that no stranger can have.
     """
 
-    def __init__(self, app: ASGIApp, *, is_on: bool, requests_per_minute: int, hosts: Collection[str] = ()) -> None:
+    def __init__(self, app: ASGIApp, *, is_on: bool, requests_per_minute: int, hosts: Collection[str]) -> None:
         self._app = app
         self._is_on = is_on
         self._hosts = frozenset(hosts)
@@ -111,7 +111,7 @@ def is_from_another_site(headers: Headers) -> bool:
         return True  # no page has an origin that is no address
 
 
-def is_own_name(host: str, hosts: Collection[str] = ()) -> bool:
+def is_own_name(host: str, hosts: Collection[str]) -> bool:
     """Whether a ``Host`` header has one of these names, or one that no stranger can bind to this machine.
 
     That is an address, a name of one label, or one below a domain that the DNS at large does not have.

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, JsonValue, TypeAdapter
 from pydantic.dataclasses import dataclass
 
-from service.calibration.calibrate import Picture, Task, calibrate
+from service.calibration.calibrate import Picture, Task
 from service.calibration.report import Method, PictureReport, Report, Result, Role
 from service.calibration.target import CircleGrid
 from service.errors import CamindError
@@ -71,9 +71,7 @@ RESULT = TypeAdapter(Result)
 class Runner:
     """Works a spool off in a thread of its own, between ``start`` and ``close``."""
 
-    def __init__(
-        self, calibrations: Calibrations, spool: Spool, limits: ImageLimits, calibrate: Calibrate = calibrate
-    ) -> None:
+    def __init__(self, calibrations: Calibrations, spool: Spool, limits: ImageLimits, calibrate: Calibrate) -> None:
         self._calibrations = calibrations
         self._spool = spool
         self._limits = limits

@@ -76,15 +76,15 @@ class _Request:
 class Estimator:
     """Made once from a model folder; ``estimate`` may be called from several threads at once."""
 
-    def __init__(self, pair: GraphPair, pixel_budget: int = PIXEL_BUDGET, kept_s: float = KEPT_S) -> None:
+    def __init__(self, pair: GraphPair, pixel_budget: int = PIXEL_BUDGET) -> None:
         self._pair = pair
         self._pixel_budget = pixel_budget
-        self._freeing = Later(pair.free_memory, kept_s)
+        self._freeing = Later(pair.free_memory, KEPT_S)
         self._stop_freeing = weakref.finalize(self, self._freeing.stop)
 
     @classmethod
     def from_folder(cls, folder: ModelFolder, *, intra_op_threads: int = 1) -> Self:
-        """Load both graphs; raises ``ModelFolderError`` where they are not what the manifest says."""
+        """Load its graphs; raises ``ModelFolderError`` where they are not what the manifest says."""
         return cls(GraphPair(folder, intra_op_threads))
 
     @property
