@@ -9,24 +9,23 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime, timedelta
-from typing import Literal
+from typing import Literal, get_args
 
 from pydantic import JsonValue
 from sqlalchemy import Engine, func, update
-from sqlalchemy.exc import IntegrityError
 from sqlmodel import Session, col, select
 
 from service.errors import Conflict, NotFound
 from service.optics.camera import Camera
 from service.principal import LOCAL
 from service.storage.cameras import store_calibrated
-from service.storage.engine import reading, writing
+from service.storage.engine import again_if_beaten, reading, writing
 from service.storage.idempotency import Once, note, noted, outcome_of
 from service.storage.tables import CalibrationRow
 
 State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 EndState = Literal["succeeded", "failed", "cancelled"]
-STATES: tuple[State, ...] = ("queued", "running", "succeeded", "failed", "cancelled")
+STATES: tuple[State, ...] = get_args(State)
 LIVE: tuple[State, ...] = ("queued", "running")
 
 ID_PATTERN = r"^[0-9a-f]{32}$"
@@ -117,11 +116,7 @@ class Calibrations:
 
         Raises ``KeyReused`` where ``once`` came with another request.
         """
-        try:
-            return self._add(draft, once)
-        except IntegrityError:
-            # the same request, sent twice at once to two processes: the other one's is there now
-            return self._add(draft, once)
+        return again_if_beaten(self._add, draft, once)
 
     def has_done(self, key: str) -> bool:
         """Whether a request with this Idempotency-Key was done before."""
@@ -219,22 +214,14 @@ class Calibrations:
 
     def finish(self, calibration_id: str, ending: Ending) -> bool:
         """End a running calibration and store its camera, both or neither; whether it was still running."""
-        try:
-            return self._finish(calibration_id, ending)
-        except IntegrityError:
-            # another process made the camera's name between the look and the insert: now it is there to revise
-            return self._finish(calibration_id, ending)
+        return again_if_beaten(self._finish, calibration_id, ending)
 
     def accept(self, calibration_id: str, name: str, camera: Camera) -> CalibrationRecord:
         """Store what a calibration found as a camera, new or at a new revision, once: again, it is as it was.
 
         Raises ``NotFound``, ``Conflict`` where it was accepted under another name.
         """
-        try:
-            return self._accept(calibration_id, name, camera)
-        except IntegrityError:
-            # another process made the camera's name between the look and the insert: now it is there to revise
-            return self._accept(calibration_id, name, camera)
+        return again_if_beaten(self._accept, calibration_id, name, camera)
 
     def cancel(self, calibration_id: str) -> State:
         """Cancel what has not ended; the state before. Raises ``NotFound``."""

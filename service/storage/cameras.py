@@ -8,17 +8,16 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Literal
+from typing import Literal, get_args
 
 from sqlalchemy import BindParameter, Engine, bindparam
-from sqlalchemy.exc import IntegrityError
 from sqlmodel import Session, col, select
 from sqlmodel.sql.expression import Select
 
 from service.errors import BadRequest, Conflict, NotFound, PreconditionFailed
 from service.optics.camera import Camera, Intrinsics, Lens
 from service.principal import LOCAL
-from service.storage.engine import reading, writing
+from service.storage.engine import again_if_beaten, reading, writing
 from service.storage.idempotency import Once, note, outcome_of
 from service.storage.tables import CameraRevisionRow, CameraRow
 
@@ -26,7 +25,7 @@ NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 DEFAULT_K_R = 4.0
 
 Source = Literal["given", "lens", "calibration"]
-SOURCES: tuple[Source, ...] = ("given", "lens", "calibration")
+SOURCES: tuple[Source, ...] = get_args(Source)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,11 +79,7 @@ class Cameras:
 
         Raises ``Conflict`` where the name is taken, ``KeyReused`` where ``once`` came with another request.
         """
-        try:
-            return self._add(draft, once)
-        except IntegrityError:
-            # another process was faster between the look and the insert: now there is something to be seen
-            return self._add(draft, once)
+        return again_if_beaten(self._add, draft, once)
 
     def get(self, name: str) -> CameraRecord:
         """The camera at its current revision. Raises ``NotFound``."""

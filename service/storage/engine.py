@@ -1,9 +1,10 @@
 """The database engine: SQLite by default, PostgreSQL by the same URL, both with durable commits."""
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import ParamSpec, TypeVar
 
 from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url
 from sqlalchemy.exc import DatabaseError, DataError, IntegrityError
@@ -12,6 +13,9 @@ from sqlalchemy.pool import ConnectionPoolEntry
 from sqlmodel import Session
 
 from service.errors import Busy, CamindError, InsufficientStorage, NotReady
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 BUSY_TIMEOUT_MS = 5_000
 POOL_TIMEOUT_S = 5.0
@@ -67,6 +71,14 @@ def writing(engine: Engine) -> Iterator[Session]:
     """
     with _translated(), Session(engine.execution_options(**{IS_WRITE: True})) as session, session.begin():
         yield session
+
+
+def again_if_beaten(write: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+    """Write once more where another process was faster between the look and the insert: its row is there now."""
+    try:
+        return write(*args, **kwargs)
+    except IntegrityError:
+        return write(*args, **kwargs)
 
 
 @contextmanager
