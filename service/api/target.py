@@ -4,16 +4,12 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Response
 
+from service.api.calibration_schemas import Circles, Millimetres
 from service.api.problems import responses
 from service.calibration.target import CircleGrid, Kind, Paper, Sheet, as_pdf, as_svg, lay_out
 from service.errors import BadRequest
 
-MOST_CIRCLES = 40
-
 router = APIRouter(prefix="/calibrate", tags=["calibration"])
-
-Circles = Annotated[int, Query(ge=2, le=MOST_CIRCLES)]
-Millimetres = Annotated[float, Query(gt=0, le=1000, allow_inf_nan=False)]
 
 
 def grid_of_query(
