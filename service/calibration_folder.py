@@ -11,7 +11,7 @@ from service.calibration.calibrate import Picture, Task, calibrate
 from service.calibration.fit import Interval
 from service.calibration.report import PictureReport, Report, Role
 from service.inference.images import SUFFIXES, ImageLimits, photographs_in, read_stored_frame
-from service.tables import photographs, shown
+from service.tables import name_column, shown
 
 REPORT = TypeAdapter(Report)
 
@@ -61,7 +61,7 @@ def write(report: Report, out: Path) -> None:
 
 
 def _table(report: Report) -> Table:
-    table = Table(photographs(), "circles", "blur px", "distance m", "tilt deg", "", box=None, pad_edge=False)
+    table = Table(name_column(), "circles", "blur px", "distance m", "tilt deg", "", box=None, pad_edge=False)
     for picture in report.pictures:
         figures = ((picture.blur_px, ".2f"), (picture.distance_m, ".3f"), (picture.tilt_deg, ".0f"))
         numbers = ["" if value is None else format(value, form) for value, form in figures]

@@ -22,7 +22,7 @@ from service.inference.estimator import Estimator
 from service.inference.images import SUFFIXES, ImageLimits, photographs_in
 from service.memory import keep_freed_memory
 from service.storage.cameras import CameraRecord
-from service.tables import photographs, shown
+from service.tables import name_column, shown
 
 ENDINGS = {"preview": ".jpg"}  # of the others it is their name
 
@@ -157,8 +157,8 @@ def _write(file: Path, body: bytes) -> None:
 
 
 def _print(made: Sequence[tuple[Path, Made]]) -> None:
-    depths = Table(photographs(), "median m", "5 to 95 % m", "answered", "focus m", "", box=None, pad_edge=False)
-    points = Table(photographs(), "u", "v", "depth m", "sigma m", "other side m", box=None, pad_edge=False)
+    depths = Table(name_column(), "median m", "5 to 95 % m", "answered", "focus m", "", box=None, pad_edge=False)
+    points = Table(name_column(), "u", "v", "depth m", "sigma m", "other side m", box=None, pad_edge=False)
     for path, one in made:
         if one.read is None:
             depths.add_row(shown(path.name), "", "", "", "", f"no depth: {one.remarks}")

@@ -5,8 +5,8 @@ import os
 from rich.table import Column
 
 
-def photographs() -> Column:
-    """A column of their names, which are never cut short."""
+def name_column() -> Column:
+    """A column of photographs' names, which are never cut short."""
     return Column("photograph", overflow="fold")
 
 

@@ -43,7 +43,7 @@ class Contents:
     rows: dict[str, int]
 
     def __str__(self) -> str:
-        rows = ", ".join(f"{table} {count}" for table, count in self.rows.items())
+        rows = ", ".join(f"{name} {count}" for name, count in self.rows.items())
         return f"{rows or 'no tables'}; schema {self.revision}"
 
 
