@@ -59,7 +59,7 @@ REFERENCE = Camera(640, 480, 2.0, 3.81, 0.5, intrinsics=Intrinsics.centred(FRAME
 class Case:
     """One picture to answer: ``truth_m`` is NaN where it is not scored, ``blur_px`` None where lambda is not known.
 
-    Two are equal where they are one: what was found of a case is remembered by it.
+    Cases are compared by identity, so that what was found of one can be cached by it.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""What training adds to the command ``camind``: train, average, export, verify, evaluate, bench, blender."""
+"""What training adds to ``camind``: train, narrow, average, export, verify, evaluate, bench, blender, homes."""
 
 import json
 import shutil

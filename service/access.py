@@ -1,7 +1,7 @@
 """Who may do what: API keys in front of every request but those for health and the page, their scopes, and their quota.
 
-Where no key is asked for, whoever is at this machine may do all, and so could any page in their browser: it may not,
-nor may one whose own name has been bound to this machine (DNS rebinding), for which the browser sees one site in both.
+Where no key is asked for, whoever is at this machine may do everything. Pages of other sites in their browser may not;
+nor may a page whose own host name was bound to this machine (DNS rebinding), which the browser takes for the same site.
 
 A scope is asked for by path, before a route or a body is looked at; a path that is not named here takes any key.
 """

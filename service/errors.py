@@ -22,7 +22,8 @@ CamindError
 ├── NotReady (503)             a part of the service is not up
 └── InsufficientStorage (507)  the disk is full
 
-Domain code raises these and knows no HTTP beyond the class; one handler turns them into problem+json.
+Domain code raises these and knows no HTTP beyond the class; one handler turns them into problem+json. What is no HTTP
+request at all has two errors of its own (400 and 431), in ``service.server``.
 """
 
 from dataclasses import dataclass

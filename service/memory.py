@@ -18,7 +18,7 @@ LARGEST_KEPT_BYTES = 16 * 2**20
 
 
 def keep_freed_memory() -> None:
-    """Keep up to ``KEPT_BYTES`` an arena that are free, in blocks up to ``LARGEST_KEPT_BYTES``; glibc alone can."""
+    """Keep up to ``KEPT_BYTES`` of freed memory an arena, in blocks up to ``LARGEST_KEPT_BYTES``; glibc alone can."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
         mallopt(M_MMAP_THRESHOLD, LARGEST_KEPT_BYTES)

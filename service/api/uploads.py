@@ -46,7 +46,7 @@ class Upload:
 
 
 class Arrivals:
-    """What of photographs has come in and is not whole yet: the bytes of all together are bounded, as the queue is.
+    """Photographs that have arrived in part: their bytes, over all requests, are bounded, as the queue is.
 
     For the event loop alone.
     """
@@ -57,7 +57,7 @@ class Arrivals:
 
     @contextmanager
     def counted(self) -> Iterator[Callable[[int], None]]:
-        """What is given takes some more bytes, or raises ``Busy``; all are given back at the end."""
+        """Gives a function that counts some more bytes, or raises ``Busy``; all are given back at the end."""
         own_bytes = 0
 
         def take(count: int) -> None:

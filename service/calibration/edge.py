@@ -122,8 +122,7 @@ def fit_edge(
 def fit_again(edge: EdgeFit, spread: Spread) -> EdgeFit:
     """The same disc under a point spread that is known for its camera.
 
-    Small blur, which looks alike under all, is right only under the right one: a wrong one costs up to eight in a
-    hundred.
+    Small blur, which looks alike under all, is right only under the right one: a wrong one costs up to 8 %.
     """
     return _fitted(edge.patch, np.array(edge.values), spread)
 

@@ -1,4 +1,4 @@
-"""The model folder: two graphs, a model card and the manifest that vouches for them.
+"""The model folder: the graphs, a model card and the manifest that vouches for them.
 
 The manifest is the contract between training, which writes it last, and the service, which believes no
 file that it does not vouch for. Nothing here knows how a graph is run.

@@ -1,7 +1,7 @@
 """Decoders that are not trusted with the service's own process: HEIC and raw files.
 
-Each file gets a process of its own, with bounds on memory and time, no environment and no way to open anything. One
-that hangs, dies or answers nonsense is a damaged file; the service goes on.
+Each file gets a process of its own, with bounds on memory and time, nothing of the service's environment and no way to
+open anything. One that hangs, dies or answers nonsense is a damaged file; the service goes on.
 """
 
 import importlib.util
