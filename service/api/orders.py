@@ -63,12 +63,14 @@ def fulfil(cancellation: Cancellation, order: Order, estimator: Estimator) -> An
     with stopwatch.stage("decode"):
         photograph = read_photograph(order.upload.data, order.upload.media_type, order.limits)
     camera, resized = camera_of(photograph, order.camera)
-    taken = taken_otherwise(photograph.shot, order.record.draft.lens)
     part = order.query.part or Part(0, 0, photograph.width_px, photograph.height_px)
     part.require_within(photograph.width_px, photograph.height_px)
     for u, v in order.query.points:
         pixel_at(u, v, part)
     known = order.query.known_depths
+    focus_is_told = order.query.focus_distance_m is not None or known
+    focus_distance_m = None if focus_is_told else camera.focus_distance_m
+    taken = taken_otherwise(photograph.exif, order.record.draft.lens, focus_distance_m)
     for point in known:
         pixel_at(point.u, point.v, Part(0, 0, photograph.width_px, photograph.height_px), "known")
     depth_map = estimator.estimate(photograph.rgb, camera, order.query.side, cancellation, order.query.part, known)

@@ -14,7 +14,6 @@ import lensfunpy
 
 from service.inference.exif import Exif
 from service.inference.frame import MOST_ZOOM
-from service.optics import thin_lens
 
 FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
 SENSOR_WIDTHS_MM = (1.0, 70.0)
@@ -65,6 +64,8 @@ def draft_camera(exif: Exif, width_px: int, height_px: int) -> Draft:
             f"taken with a digital zoom of {exif.digital_zoom:g}: the frame is a part of the sensor's, enlarged, and "
             "lens.pixel_pitch_um that of what it shows"
         )
+    if exif.rendering is not None:
+        warnings.append(f"its EXIF says {exif.rendering}: take one without, whose blur is the lens'")
     return Draft(
         name=_name(exif),
         description=", ".join(filter(None, (_body(exif), exif.lens))) or None,
@@ -81,10 +82,8 @@ def _focus_m(exif: Exif, warnings: list[str]) -> float | None:
     if distance_m is None or not FOCUS_DISTANCES_M[0] <= distance_m <= FOCUS_DISTANCES_M[1]:
         warnings.append("its EXIF does not say where the lens was focused: focus_distance_m is needed")
         return None
-    focal_length_m, from_lens = (exif.focal_length_mm or math.inf) / 1e3, ""
-    if 4 * focal_length_m <= distance_m:
-        focus_m = thin_lens.focus_from_lens(distance_m, focal_length_m)
-        from_lens = f" and counted from the sensor, {focus_m:.4g} m from the lens"
+    focus_m = exif.focus_from_lens_m
+    from_lens = f" and counted from the sensor, {focus_m:.4g} m from the lens" if focus_m else ""
     warnings.append(
         f"focused at {distance_m:g} m as the camera reports it, which is often coarse{from_lens}: better measure from "
         "the lens to what is sharpest"

@@ -1,28 +1,27 @@
 """What a photograph's EXIF says of lens and sensor. Nothing else in it is looked at, least of all the position."""
 
+import math
 import struct
 from dataclasses import dataclass, replace
 
 from service.errors import InvalidImage
-from service.inference.headers import (
-    EXIF_DIGITAL_ZOOM,
-    EXIF_F_NUMBER,
-    EXIF_FOCAL_LENGTH,
-    TiffDirectory,
-    exif_directories,
-)
+from service.inference.headers import TiffDirectory, exif_directories
+from service.optics import thin_lens
 
 MAKE, MODEL = 271, 272
+F_NUMBER, FOCAL_LENGTH, RENDERED, DIGITAL_ZOOM = 0x829D, 0x920A, 0xA401, 0xA404
 SUBJECT_DISTANCE, FOCAL_LENGTH_35MM, LENS_MODEL = 0x9206, 0xA405, 0xA434
 WIDTH, HEIGHT, PLANE_RESOLUTION, PLANE_UNIT = 0xA002, 0xA003, 0xA20E, 0xA210
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 MOST_TEXT = 64
 INFINITY = 2**32 - 1  # all ones, in a distance
+# what phones write beyond the standard's 0 and 1
+RENDERINGS = {6: "a panorama", 7: "a portrait mode", 8: "a portrait mode"}
 
 
 @dataclass(frozen=True, slots=True)
 class Exif:
-    """The tags that make a camera; None where a tag is missing, empty or no positive number."""
+    """The tags that make a camera, and what it did; None where a tag is missing, empty or no positive number."""
 
     make: str | None = None
     model: str | None = None
@@ -35,6 +34,15 @@ class Exif:
     width_px: int | None = None
     height_px: int | None = None
     focal_plane_pitch_um: float | None = None
+    rendering: str | None = None
+
+    @property
+    def focus_from_lens_m(self) -> float | None:
+        """Where the lens was focused, if ``subject_distance_m`` counts from the sensor; None where none is so near."""
+        distance_m, focal_length_m = self.subject_distance_m, (self.focal_length_mm or math.inf) / 1e3
+        if distance_m is None or distance_m < 4 * focal_length_m:
+            return None
+        return thin_lens.focus_from_lens(distance_m, focal_length_m)
 
 
 def read_exif(exif: bytes) -> Exif:
@@ -52,14 +60,15 @@ def _with_shot(body: Exif, shot: TiffDirectory) -> Exif:
     return replace(
         body,
         lens=_text(shot, LENS_MODEL),
-        focal_length_mm=_number(shot, EXIF_FOCAL_LENGTH),
+        focal_length_mm=_number(shot, FOCAL_LENGTH),
         focal_length_35mm=_number(shot, FOCAL_LENGTH_35MM),
-        f_number=_number(shot, EXIF_F_NUMBER),
+        f_number=_number(shot, F_NUMBER),
         subject_distance_m=_number(shot, SUBJECT_DISTANCE),
-        digital_zoom=_number(shot, EXIF_DIGITAL_ZOOM),
+        digital_zoom=_number(shot, DIGITAL_ZOOM),
         width_px=int(width) if width else None,
         height_px=int(height) if height else None,
         focal_plane_pitch_um=_pitch_um(shot),
+        rendering=RENDERINGS.get(int(_number(shot, RENDERED) or 0)),
     )
 
 

@@ -1,11 +1,14 @@
 """Whether a photograph is a camera's frame, and the camera as that photograph has it."""
 
+from collections.abc import Iterator
+
 from service.errors import ImageSizeMismatch
-from service.inference.headers import Shot
+from service.inference.exif import Exif
 from service.inference.images import TURNS, UNTURNS, Photograph
 from service.optics.camera import Camera, Lens
 
 LENS_TOLERANCE = 0.05
+FOCUS_TOLERANCE = 0.15
 MOST_ZOOM = 1.01
 
 
@@ -50,17 +53,35 @@ def camera_of(photograph: Photograph, camera: Camera) -> tuple[Camera, tuple[str
     return resized, (warning,)
 
 
-def taken_otherwise(shot: Shot, lens: Lens | None) -> tuple[str, ...]:
-    """Warnings where a photograph was zoomed, or not taken with the camera's lens as registered."""
-    zoom = shot.digital_zoom or 1.0
-    zoomed = f"its EXIF says a digital zoom of {zoom:.4g}: the metres hold for a camera registered at that zoom alone"
-    return (*((zoomed,) if zoom > MOST_ZOOM else ()), *(_other_lens(shot, lens) if lens else ()))
+def taken_otherwise(exif: Exif, lens: Lens | None, focus_distance_m: float | None) -> Iterator[str]:
+    """Warnings where a photograph was zoomed, rendered, or not taken with the lens or the focus that were told.
+
+    ``focus_distance_m`` is the camera's where the photograph came without one of its own.
+    """
+    zoom = exif.digital_zoom or 1.0
+    if zoom > MOST_ZOOM:
+        yield f"its EXIF says a digital zoom of {zoom:.4g}: the metres hold for a camera registered at that zoom alone"
+    if exif.rendering is not None:
+        yield f"its EXIF says {exif.rendering}: its blur may be computed, and no lens'"
+    if lens is not None:
+        yield from _other_lens(exif, lens)
+    if focus_distance_m is not None:
+        yield from _other_focus(exif, focus_distance_m)
 
 
-def _other_lens(shot: Shot, lens: Lens) -> tuple[str, ...]:
-    told = ((shot.focal_length_mm, lens.focal_length_mm, "{:g} mm"), (shot.f_number, lens.f_number, "f/{:g}"))
+def _other_lens(exif: Exif, lens: Lens) -> Iterator[str]:
+    told = ((exif.focal_length_mm, lens.focal_length_mm, "{:g} mm"), (exif.f_number, lens.f_number, "f/{:g}"))
     known = [(theirs, ours, form) for theirs, ours, form in told if theirs is not None]
-    if all(abs(theirs / ours - 1) <= LENS_TOLERANCE for theirs, ours, _ in known):
-        return ()
-    says = " ".join(form.format(round(theirs, 2)) for theirs, _, form in known)
-    return (f"its EXIF says {says}, the camera is {lens.focal_length_mm:g} mm f/{lens.f_number:g}",)
+    if any(abs(theirs / ours - 1) > LENS_TOLERANCE for theirs, ours, _ in known):
+        says = " ".join(form.format(round(theirs, 2)) for theirs, _, form in known)
+        yield f"its EXIF says {says}, the camera is {lens.focal_length_mm:g} mm f/{lens.f_number:g}"
+
+
+def _other_focus(exif: Exif, focus_distance_m: float) -> Iterator[str]:
+    """What cameras note is coarse, and counts from the sensor in most."""
+    noted = [each for each in (exif.subject_distance_m, exif.focus_from_lens_m) if each is not None]
+    if noted and all(abs(each / focus_distance_m - 1) > FOCUS_TOLERANCE for each in noted):
+        yield (
+            f"its EXIF says that it was focused at {noted[0]:.4g} m, the camera at {focus_distance_m:.4g} m: "
+            "send this shot's focus_distance_m"
+        )

@@ -39,7 +39,7 @@ TIFF_TYPES = {1: "B", 3: "H", 4: "I", 13: "I"}
 # with those that are no whole numbers: a rational is two
 TIFF_NUMBERS = {**TIFF_TYPES, 5: "II", 11: "f", 12: "d"}
 TIFF_TEXT, TIFF_MOST_TEXT = 2, 256
-EXIF_DIRECTORY, EXIF_F_NUMBER, EXIF_FOCAL_LENGTH, EXIF_DIGITAL_ZOOM = 34665, 33437, 37386, 41988
+EXIF_DIRECTORY = 34665
 TIFF_MAX_VALUES = 100_000
 TIFF_MAX_ENTRIES = 4_096
 TIFF_TILE_SIZE = (322, 323)
@@ -63,15 +63,6 @@ class Header:
     orientation_offset: int | None = None
     exif: bytes = b""
     has_more: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Shot:
-    """What lens and camera were set to; None for what is not told."""
-
-    focal_length_mm: float | None = None
-    f_number: float | None = None
-    digital_zoom: float | None = None
 
 
 def sniff(data: bytes) -> Kind | None:
@@ -286,16 +277,6 @@ def _exif_orientation(data: bytes) -> int:
         return TiffDirectory(data).orientation()
     except (struct.error, InvalidImage):
         return 1
-
-
-def read_shot(exif: bytes) -> Shot:
-    """What an EXIF block says of a shot, three numbers at most; one that cannot be read says nothing."""
-    try:
-        _, shot = exif_directories(exif)
-        tags = (EXIF_FOCAL_LENGTH, EXIF_F_NUMBER, EXIF_DIGITAL_ZOOM)
-        return Shot(*(shot.number(tag) for tag in tags)) if shot else Shot()
-    except (struct.error, InvalidImage):
-        return Shot()
 
 
 def exif_directories(exif: bytes) -> "tuple[TiffDirectory, TiffDirectory | None]":

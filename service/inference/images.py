@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from service import PIXEL_CEILING
 from service.config import Settings
 from service.errors import InvalidImage, TooLarge, UnsupportedKind
-from service.inference.headers import Header, Kind, Shot, read_header, read_shot
+from service.inference.exif import Exif, read_exif
+from service.inference.headers import Header, Kind, read_header
 from service.inference.isolated import decode_isolated
 from service.opencv import cv2
 
@@ -80,7 +81,7 @@ class Photograph:
     kind: Kind
     orientation: int
     warnings: tuple[str, ...] = ()
-    shot: Shot = field(default_factory=Shot)
+    exif: Exif = field(default_factory=Exif)
 
     @property
     def width_px(self) -> int:
@@ -108,7 +109,7 @@ def read_photograph(data: bytes, media_type: str | None = None, limits: ImageLim
     warnings: tuple[str, ...] = (f"declared {media_type}, read as {kind}",) if declared not in (None, kind) else ()
     if header.has_more:
         warnings += ("the file has more than one picture: the first was read",)
-    return Photograph(turned(stored, orientation), kind, orientation, warnings, read_shot(header.exif))
+    return Photograph(turned(stored, orientation), kind, orientation, warnings, read_exif(header.exif))
 
 
 def read_stored_frame(data: bytes, limits: ImageLimits | None = None) -> NDArray[np.uint8]:

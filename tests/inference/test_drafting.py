@@ -10,14 +10,14 @@ import pytest
 
 from service.inference.drafting import Draft, draft_camera
 from service.inference.exif import Exif, read_exif
-from service.inference.headers import read_header, read_shot
+from service.inference.headers import read_header
 from service.storage.cameras import NAME_PATTERN
 from tests.inference.heics import heic
 from tests.inference.photographs import ExifValue, corners, exif_of, jpeg, png, tiff, webp, with_exif
 
 MAKE, MODEL = 271, 272
 F_NUMBER, FOCAL, SUBJECT, WIDTH, FOCAL_35, ZOOM, LENS = 0x829D, 0x920A, 0x9206, 0xA002, 0xA405, 0xA404, 0xA434
-PLANE_RESOLUTION, PLANE_UNIT = 0xA20E, 0xA210
+PLANE_RESOLUTION, PLANE_UNIT, RENDERED = 0xA20E, 0xA210, 0xA401
 NIKON = {MAKE: "NIKON CORPORATION", MODEL: "NIKON D200"}
 SHOT: dict[int, ExifValue] = {F_NUMBER: (28, 10), FOCAL: (350, 10), FOCAL_35: 52, WIDTH: 3872}
 D200 = Exif("NIKON CORPORATION", "NIKON D200", None, 35.0, 52.0, 2.8, None, None, 3872, None, None)
@@ -40,11 +40,17 @@ def test_tags_are_read_from_a_jpeg_s_exif() -> None:
     assert found.focal_plane_pitch_um == pytest.approx(1e4 / 4164)
 
 
+@pytest.mark.parametrize(("tag", "rendering"), [(0, None), (1, None), (6, "a panorama"), (8, "a portrait mode")])
+def test_a_phone_s_rendering_is_read_and_said(tag: int, rendering: str | None) -> None:
+    found = read_exif(exif_of(NIKON, SHOT | {RENDERED: tag}))
+    assert found.rendering == rendering
+    assert said(draft_camera(found, 3872, 2592), "its EXIF says", "take one without") == (rendering is not None)
+
+
 @pytest.mark.parametrize("version", [0, 1, 2])
 def test_tags_are_read_from_a_heic(version: int) -> None:
     found = read_header(heic(exif=exif_of(NIKON, SHOT), version=version))
     assert read_exif(found.exif) == D200
-    assert read_shot(found.exif).focal_length_mm == 35.0
 
 
 def test_a_list_of_items_in_a_heic_that_leads_back_to_itself_is_left() -> None:

@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 
 from service.errors import ImageSizeMismatch
+from service.inference.exif import Exif
 from service.inference.frame import camera_of, taken_otherwise
-from service.inference.headers import Shot
 from service.inference.images import TURNS, Photograph, turned
 from service.opencv import cv2
 from service.optics import thin_lens
@@ -78,24 +78,51 @@ def test_a_frame_made_larger_scales_gamma_alike() -> None:
 
 
 @pytest.mark.parametrize(
-    ("shot", "words"),
+    ("exif", "words"),
     [
-        (Shot(35.0, 2.8), "its EXIF says 35 mm f/2.8, the camera is 50 mm f/1.2"),
-        (Shot(50.0, 1.8), "its EXIF says 50 mm f/1.8, the camera is 50 mm f/1.2"),
-        (Shot(None, 1.8), "its EXIF says f/1.8, the camera is 50 mm f/1.2"),
-        (Shot(53.0), "its EXIF says 53 mm, the camera is 50 mm f/1.2"),
-        (Shot(52.0, 1.25), ""),
-        (Shot(), ""),
+        (Exif(focal_length_mm=35.0, f_number=2.8), "its EXIF says 35 mm f/2.8, the camera is 50 mm f/1.2"),
+        (Exif(focal_length_mm=50.0, f_number=1.8), "its EXIF says 50 mm f/1.8, the camera is 50 mm f/1.2"),
+        (Exif(f_number=1.8), "its EXIF says f/1.8, the camera is 50 mm f/1.2"),
+        (Exif(focal_length_mm=53.0), "its EXIF says 53 mm, the camera is 50 mm f/1.2"),
+        (Exif(focal_length_mm=52.0, f_number=1.25), ""),
+        (Exif(), ""),
     ],
 )
-def test_a_lens_that_is_not_the_camera_s_is_told(shot: Shot, words: str) -> None:
-    assert " ".join(taken_otherwise(shot, Lens(50, 1.2, 6.0, 4000))) == words
+def test_a_lens_that_is_not_the_camera_s_is_told(exif: Exif, words: str) -> None:
+    assert " ".join(taken_otherwise(exif, Lens(50, 1.2, 6.0, 4000), 2.0)) == words
 
 
 def test_a_digital_zoom_is_told_of_whatever_the_camera_was_made_from() -> None:
-    (warning,) = taken_otherwise(Shot(digital_zoom=2.0), None)
+    (warning,) = taken_otherwise(Exif(digital_zoom=2.0), None, None)
     assert "digital zoom of 2" in warning
-    assert taken_otherwise(Shot(digital_zoom=1.0), None) == ()
+    assert not [*taken_otherwise(Exif(digital_zoom=1.0), None, None)]
+
+
+def test_a_portrait_mode_is_told_of() -> None:
+    (warning,) = taken_otherwise(Exif(rendering="a portrait mode"), None, None)
+    assert "portrait mode" in warning
+
+
+@pytest.mark.parametrize(
+    ("noted_m", "focal_length_mm", "is_other"),
+    [
+        (0.5, 35.0, True),
+        (1.8, 35.0, False),
+        (2.2, None, False),
+        (2.4, None, True),
+        (None, 35.0, False),
+        (0.6, 100.0, True),
+        (2.35, 100.0, False),  # 2.24 m from the lens
+    ],
+)
+def test_another_focus_than_the_camera_s_is_told_of_unless_it_came_with_the_photograph(
+    noted_m: float | None, focal_length_mm: float | None, *, is_other: bool
+) -> None:
+    exif = Exif(focal_length_mm=focal_length_mm, subject_distance_m=noted_m)
+    said = [*taken_otherwise(exif, None, 2.0)]
+    assert len(said) == is_other
+    assert all(f"focused at {noted_m:g} m, the camera at 2 m" in words for words in said)
+    assert not [*taken_otherwise(exif, None, None)]
 
 
 @pytest.mark.parametrize(

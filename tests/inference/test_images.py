@@ -12,7 +12,8 @@ import pytest
 import tifffile
 
 from service.errors import InvalidImage, TooLarge, UnsupportedKind
-from service.inference.headers import MOST_PARTS, MOST_SCANS, Shot, read_header, read_shot
+from service.inference.exif import Exif, read_exif
+from service.inference.headers import MOST_PARTS, MOST_SCANS, read_header
 from service.inference.images import TURNS, ImageLimits, read_photograph, read_stored_frame
 from service.opencv import cv2
 from tests.inference.photographs import (
@@ -252,24 +253,24 @@ def test_what_the_lens_was_set_to_is_read_from_every_kind_of_file(value: ExifVal
     exif = exif_of({}, {FOCAL: value, APERTURE: (28, 10)})
     chunked = png(corners())[:33] + png_chunk(b"eXIf", exif) + png(corners())[33:]
     for data in (with_exif(jpeg(corners()), exif), webp(corners(), exif=exif), chunked):
-        assert read_photograph(data).shot == Shot(35.8, 2.8)
-    assert read_photograph(jpeg(corners())).shot == Shot()
+        assert read_photograph(data).exif == Exif(focal_length_mm=35.8, f_number=2.8)
+    assert read_photograph(jpeg(corners())).exif == Exif()
 
 
 @pytest.mark.parametrize("value", [(0, 1), (0, 0), (5, 0), -1.0, float("nan"), float("inf"), "35"])
 def test_a_setting_that_is_no_number_is_not_told(value: ExifValue) -> None:
     data = with_exif(jpeg(corners()), exif_of({}, {FOCAL: value, APERTURE: value}))
-    assert read_photograph(data).shot == Shot()
+    assert read_photograph(data).exif == Exif()
 
 
 def test_what_the_lens_was_set_to_is_read_at_once_and_no_damage_stops_it() -> None:
     exif = exif_of({271: "x" * 40, 272: "y" * 40}, {FOCAL: 35.0, APERTURE: 2.8})
     started = time.perf_counter()
     for _ in range(100):
-        assert read_shot(exif) == Shot(35.0, 2.8)
+        assert read_exif(exif) == Exif("x" * 40, "y" * 40, focal_length_mm=35.0, f_number=2.8)
     assert time.perf_counter() - started < 0.1
     for length in range(len(exif)):
-        read_shot(exif[:length])
+        read_exif(exif[:length])
 
 
 def pages(*subfiles: int) -> bytes:
