@@ -27,6 +27,10 @@ from model_export.networks import (
 )
 from model_export.train import Checkpoint
 from service.inference.artifact import (
+    BLUR_INPUTS,
+    BLUR_OUTPUTS,
+    DEPTH_INPUTS,
+    DEPTH_OUTPUTS,
     LAYOUT_MAP,
     LAYOUT_ODDS,
     CardFile,
@@ -90,9 +94,6 @@ class _LayoutGraph(nn.Module):
         return (self.network(layout_map),)
 
 
-BLUR_OUTPUTS = ("blur_px", "blur_log_error")
-DEPTH_INPUTS = ("relative_defocus", "relative_defocus_spread", "focus_distance_m", "focal_length_px", "side")
-DEPTH_OUTPUTS = ("log_ratio_near", "log_ratio_far", "p_near", "log_scale")
 LAYOUT_INPUTS, LAYOUT_OUTPUTS = (LAYOUT_MAP,), (LAYOUT_ODDS,)
 
 
@@ -111,7 +112,7 @@ def export_graphs(pair: Pair, folder: Path) -> Graphs:
     cells = (2, 1, height // pair.stride, width // pair.stride)
     numbers = [torch.ones(2), torch.full((2,), 500.0), torch.zeros(2)]
     inputs = (torch.rand(cells) + 0.1, torch.rand(cells) + 0.1, *numbers, seen.features)
-    blur = _write(_BlurGraph(pair.blur), (image,), ("image",), BLUR_OUTPUTS + names, folder / "blur.onnx")
+    blur = _write(_BlurGraph(pair.blur), (image,), BLUR_INPUTS, BLUR_OUTPUTS + names, folder / "blur.onnx")
     outputs: tuple[str, ...] = DEPTH_OUTPUTS
     layout = None
     if isinstance(pair.depth, CompactDepth):

@@ -24,10 +24,11 @@ from pydantic import (
 SCHEMA_VERSION: Literal[1] = 1
 MANIFEST_FILE = "manifest.json"
 FEATURES_PREFIX = "features"
-BLUR_INPUTS = frozenset({"image"})
-BLUR_OUTPUTS = frozenset({"blur_px", "blur_log_error"})
-DEPTH_INPUTS = frozenset({"relative_defocus", "relative_defocus_spread", "focus_distance_m", "focal_length_px", "side"})
-DEPTH_OUTPUTS = frozenset({"log_ratio_near", "log_ratio_far", "p_near", "log_scale"})
+# in the order that graphs are written with
+BLUR_INPUTS = ("image",)
+BLUR_OUTPUTS = ("blur_px", "blur_log_error")
+DEPTH_INPUTS = ("relative_defocus", "relative_defocus_spread", "focus_distance_m", "focal_length_px", "side")
+DEPTH_OUTPUTS = ("log_ratio_near", "log_ratio_far", "p_near", "log_scale")
 LAYOUT_MAP, LAYOUT_ODDS = "layout_map", "layout_odds"
 
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")]
@@ -44,8 +45,8 @@ def _require_ordered(interval: "Interval") -> "Interval":
     return interval
 
 
-def _require_names(what: str, names: tuple[str, ...], needed: frozenset[str] | set[str]) -> None:
-    if missing := needed - set(names):
+def _require_names(what: str, names: tuple[str, ...], *needed: str) -> None:
+    if missing := set(needed) - set(names):
         raise ValueError(f"the {what} lack {sorted(missing)}")
 
 
@@ -102,16 +103,15 @@ class Graphs(_Part):
 
     @model_validator(mode="after")
     def _fit_together(self) -> Self:
-        features = frozenset(self.feature_names)
-        _require_names("blur graph's inputs", self.blur.input_names, BLUR_INPUTS)
-        _require_names("blur graph's outputs", self.blur.output_names, BLUR_OUTPUTS | features)
-        _require_names("depth graph's inputs", self.depth.input_names, {"relative_defocus"})
-        _require_names("depth graph's outputs", self.depth.output_names, DEPTH_OUTPUTS)
+        _require_names("blur graph's inputs", self.blur.input_names, *BLUR_INPUTS)
+        _require_names("blur graph's outputs", self.blur.output_names, *BLUR_OUTPUTS, *self.feature_names)
+        _require_names("depth graph's inputs", self.depth.input_names, "relative_defocus")
+        _require_names("depth graph's outputs", self.depth.output_names, *DEPTH_OUTPUTS)
         if self.layout is not None:
-            _require_names("depth graph's outputs", self.depth.output_names, {LAYOUT_MAP, LAYOUT_ODDS})
-            _require_names("layout graph's inputs", self.layout.input_names, {LAYOUT_MAP})
-            _require_names("layout graph's outputs", self.layout.output_names, {LAYOUT_ODDS})
-        if unknown := set(self.depth.input_names) - DEPTH_INPUTS - features:
+            _require_names("depth graph's outputs", self.depth.output_names, LAYOUT_MAP, LAYOUT_ODDS)
+            _require_names("layout graph's inputs", self.layout.input_names, LAYOUT_MAP)
+            _require_names("layout graph's outputs", self.layout.output_names, LAYOUT_ODDS)
+        if unknown := set(self.depth.input_names) - {*DEPTH_INPUTS, *self.feature_names}:
             raise ValueError(f"the depth graph asks for {sorted(unknown)}, which nothing provides")
         return self
 
