@@ -120,10 +120,13 @@ class CameraSpecs(Given):
     intrinsics: PinholeIntrinsics | None = None
     description: Annotated[Annotated[str, Worded(PLAIN_TEXT, NO_CONTROLS)] | None, Field(max_length=1000)] = None
 
-    def to_camera(self) -> Camera:
-        """The camera as the physics takes it; ``BadRequest`` where the numbers do not fit together."""
-        intrinsics = self.intrinsics.to_domain() if self.intrinsics else None
+    def to_draft(self, name: str) -> CameraDraft:
+        """The camera under a name, with what it was made from; ``BadRequest`` where the numbers do not fit together."""
         lens = self.lens.to_domain() if self.lens else None
+        return CameraDraft(name, self._camera(lens), "lens" if lens else "given", lens, self.description)
+
+    def _camera(self, lens: Lens | None) -> Camera:
+        intrinsics = self.intrinsics.to_domain() if self.intrinsics else None
         try:
             return Camera(
                 image_width_px=self.image_width_px,
@@ -136,12 +139,6 @@ class CameraSpecs(Given):
             )
         except (ValueError, ArithmeticError) as exc:
             raise BadRequest.at(f"No camera has these numbers: {exc}.", "#") from exc
-
-    def to_draft(self, name: str) -> CameraDraft:
-        """The camera under a name, with what it was made from."""
-        camera = self.to_camera()
-        lens = self.lens.to_domain() if self.lens else None
-        return CameraDraft(name, camera, "lens" if lens else "given", lens, self.description)
 
     def _k_cam_px(self, lens: Lens | None) -> float:
         if lens is None and self.k_cam_px is not None:
@@ -158,7 +155,7 @@ class CameraSpecs(Given):
         return lens.k_cam_px(self.focus_distance_m, self.image_width_px)
 
 
-# what to_camera asks for, said to programs
+# what to_draft asks for, said to programs
 K_CAM_OR_LENS: dict[str, JsonValue] = {
     "oneOf": [
         {"required": ["k_cam_px"], "properties": {"k_cam_px": {"type": "number"}, "lens": {"type": "null"}}},
