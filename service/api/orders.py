@@ -63,7 +63,8 @@ def fulfil(cancellation: Cancellation, order: Order, estimator: Estimator) -> An
     with stopwatch.stage("decode"):
         photograph = read_photograph(order.upload.data, order.upload.media_type, order.limits)
     camera, resized = camera_of(photograph, order.camera)
-    part = order.query.part or Part(0, 0, photograph.width_px, photograph.height_px)
+    whole = Part(0, 0, photograph.width_px, photograph.height_px)
+    part = order.query.part or whole
     part.require_within(photograph.width_px, photograph.height_px)
     for u, v in order.query.points:
         pixel_at(u, v, part)
@@ -72,7 +73,7 @@ def fulfil(cancellation: Cancellation, order: Order, estimator: Estimator) -> An
     focus_distance_m = None if focus_is_told else camera.focus_distance_m
     taken = taken_otherwise(photograph.exif, order.record.draft.lens, focus_distance_m)
     for point in known:
-        pixel_at(point.u, point.v, Part(0, 0, photograph.width_px, photograph.height_px), "known")
+        pixel_at(point.u, point.v, whole, "known")
     depth_map = estimator.estimate(photograph.rgb, camera, order.query.side, cancellation, order.query.part, known)
     stopwatch.add(depth_map.timings_ms)
     warnings = (*order.warnings, *photograph.warnings, *taken, *resized, *depth_map.warnings)
