@@ -14,7 +14,7 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import parse_options_header
 
 from service.api.calibration_schemas import SETTINGS_FIELD
-from service.api.problems import invalid_request
+from service.api.problems import invalid_request, printable
 from service.api.uploads import MULTIPART
 from service.errors import BadRequest, InvalidImage, TooLarge, UnsupportedKind
 from service.inference.headers import sniff
@@ -217,9 +217,7 @@ class _Parts:
     def _unused_name(self, part: _Part) -> str:
         """The user's name for the file, printable and different from the others'."""
         last = re.split(r"[/\\]", part.file_name or "")[-1]
-        name = (
-            re.sub(r"[\x00-\x1f\x7f\ud800-\udfff]", "?", last)[:MOST_NAME] or f"{part.role}-{len(self._pictures) + 1}"
-        )
+        name = printable(last)[:MOST_NAME] or f"{part.role}-{len(self._pictures) + 1}"
         used = {picture.name for picture in self._pictures}
         numbered = (f"{name} ({number})" for number in count(2))
         return name if name not in used else next(each for each in numbered if each not in used)

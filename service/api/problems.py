@@ -183,8 +183,8 @@ def _pointer(fault: Mapping[str, Any]) -> str:
     if fault["type"] == "json_invalid" or (source == "body" and not path):
         return "#"
     if source != "body":
-        return ".".join(map(_printable, path)) or str(source)
-    return "#" + "".join(f"/{_printable(part).replace('~', '~0').replace('/', '~1')}" for part in path)
+        return ".".join(map(printable, path)) or str(source)
+    return "#" + "".join(f"/{printable(part).replace('~', '~0').replace('/', '~1')}" for part in path)
 
 
 def _detail(fault: Mapping[str, Any]) -> str:
@@ -193,7 +193,7 @@ def _detail(fault: Mapping[str, Any]) -> str:
     if fault["type"] == "extra_forbidden":
         return _unknown_field(*map(str, fault["loc"]))
     words = PLAIN_WORDS.get(fault["type"], str(fault["msg"]))
-    return _printable(words.removeprefix("Value error, "))
+    return printable(words.removeprefix("Value error, "))
 
 
 def _unknown_field(*path: str) -> str:
@@ -208,6 +208,6 @@ def _unknown_field(*path: str) -> str:
     return "There is no such field: remove it, or correct its name."
 
 
-def _printable(part: object) -> str:
+def printable(part: object) -> str:
     """Text that is safe in JSON and short: control characters and lone surrogates become question marks."""
     return re.sub(r"[\x00-\x1f\x7f\ud800-\udfff]", "?", str(part))[:200]
