@@ -1,13 +1,16 @@
 """A stand-in for ``calibrate`` with a fixed answer, which can be held back, told in steps, or made to fail.
 
-And a database that fails meanwhile.
+And what is sent to it, and a database that fails meanwhile.
 """
 
+import json
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
+from httpx2 import Request
 from pydantic import JsonValue
 from sqlalchemy import Engine
 
@@ -40,6 +43,15 @@ SETTINGS: dict[str, JsonValue] = {
     "method": "edge",
     "register": False,
 }
+
+
+def calibration_form(*pictures: bytes, register: bool = False) -> Request:
+    """A form with so many defocused photographs, for its content and the content type that goes with it."""
+    settings = (None, json.dumps({**SETTINGS, "register": register}), "application/json")
+    files: list[tuple[str, Any]] = [("defocused", ("near.png", picture, "image/png")) for picture in pictures]
+    request = Request("POST", "http://service/calibrate", files=[("settings", settings), *files])
+    request.read()
+    return request
 
 
 @contextmanager

@@ -2,7 +2,9 @@
 
 import sys
 from pathlib import Path
+from typing import Any
 
+from model_export.served import Server
 from service import logs, server
 from service.app import create_app
 from service.config import load_settings
@@ -17,6 +19,21 @@ def write_command(folder: Path) -> Path:
     program.write_text(f"#!{sys.executable}\nfrom tests.held_server import main\nmain()\n")
     program.chmod(0o755)
     return program
+
+
+def ended_calibration(server: Server, path: str) -> dict[str, Any]:
+    """A calibration, once it has ended."""
+
+    def look() -> dict[str, Any] | None:
+        body = server.ask("GET", path).json()
+        return None if body["state"] in ("queued", "running") else body
+
+    return server.poll(look)
+
+
+def folders(data_dir: Path) -> list[str]:
+    """The calibrations whose photographs are there."""
+    return [path.name for path in (data_dir / "calibrations").iterdir() if path.is_dir()]
 
 
 def main() -> None:

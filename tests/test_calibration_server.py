@@ -8,17 +8,15 @@ import sqlite3
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 from httpx2 import Request
 
 from model_export.served import Reply, Server
 from model_export.served import serving as start
-from tests.fake_calibration import SETTINGS
-from tests.held_server import GO, write_command
+from tests.fake_calibration import calibration_form
+from tests.held_server import GO, ended_calibration, folders, write_command
 from tests.inference.photographs import corners, png
 
 RECEIVE_DEADLINE_S = 1.0
@@ -34,16 +32,7 @@ def serving(data_dir: Path, model_dir: Path) -> AbstractContextManager[Server]:
 
 
 def form() -> Request:
-    settings = json.dumps({**SETTINGS, "register": True})
-    picture = ("near.png", png(corners()), "image/png")
-    files: list[tuple[str, Any]] = [
-        ("settings", (None, settings, "application/json")),
-        ("defocused", picture),
-        ("defocused", picture),
-    ]
-    request = Request("POST", "http://service/calibrate", files=files)
-    request.read()
-    return request
+    return calibration_form(png(corners()), png(corners()), register=True)
 
 
 def post(server: Server, **headers: str) -> Reply:
@@ -59,10 +48,6 @@ def running(server: Server) -> str:
     path = reply.headers["location"]
     server.poll(lambda: server.ask("GET", path).json()["images"])
     return path
-
-
-def folders(data_dir: Path) -> list[str]:
-    return [path.name for path in (data_dir / "calibrations").iterdir() if path.is_dir()]
 
 
 @pytest.fixture
@@ -84,7 +69,7 @@ def test_what_was_acknowledged_survives_a_kill(data_dir: Path, tiny_model_dir: P
     (data_dir / GO).touch()
     with serving(data_dir, tiny_model_dir) as second:
         for revision, path in enumerate(paths, 1):
-            body = second.poll(partial(_ended, second, path))
+            body = ended_calibration(second, path)
             assert (body["state"], body["camera_revision"]) == ("succeeded", revision)
         assert second.ask("GET", "/cameras/bench").json()["revision"] == 2
         second.poll(lambda: folders(data_dir) == [])
@@ -163,8 +148,3 @@ def _half_sent(server: Server, request: Request, headers: str = "") -> socket.so
     connection = server.connect()
     connection.sendall(head.encode() + request.content[:100])
     return connection
-
-
-def _ended(server: Server, path: str) -> dict[str, Any] | None:
-    body = server.ask("GET", path).json()
-    return None if body["state"] in ("queued", "running") else body

@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from httpx2 import Request
 
 from model_export.served import CAMIND, Reply, Server, serving
-from tests.fake_calibration import SETTINGS
+from tests.fake_calibration import calibration_form
 from tests.inference.photographs import corners, png
 
 JSON = {"Content-Type": "application/json"}
@@ -35,11 +34,7 @@ def replacement() -> str:
 
 
 def post_calibration(server: Server) -> Reply:
-    settings = (None, json.dumps(SETTINGS), "application/json")
-    picture = ("a.png", png(corners()) + bytes(50_000), "image/png")
-    files: list[tuple[str, Any]] = [("settings", settings), ("defocused", picture)]
-    request = Request("POST", "http://service/calibrate", files=files)
-    request.read()
+    request = calibration_form(png(corners()) + bytes(50_000))
     kind = request.headers["content-type"]
     return server.ask("POST", "/calibrate?camera=bench", request.content, {"Content-Type": kind})
 

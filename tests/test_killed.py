@@ -15,14 +15,12 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
-from httpx2 import Request
 
 from model_export.served import Server, serving
-from tests.fake_calibration import SETTINGS
-from tests.held_server import GO, write_command
+from tests.fake_calibration import calibration_form
+from tests.held_server import GO, ended_calibration, folders, write_command
 from tests.inference.photographs import corners, png
 
 ROUNDS, SOAK_ROUNDS = 3, 100
@@ -96,10 +94,11 @@ class Round:
                 raise AssertionError(f"{request[0]} of {name} was answered {status}")
 
     def _calibrate(self, number: int) -> None:
-        content, headers = _form()
+        form = calibration_form(png(corners()), register=True)
+        headers = {"Content-Type": form.headers["content-type"]}
         while True:
             try:
-                reply = self._server.ask("POST", f"/calibrate?camera=calibrated-{number}", content, headers)
+                reply = self._server.ask("POST", f"/calibrate?camera=calibrated-{number}", form.content, headers)
             except (OSError, http.client.HTTPException):
                 return
             if reply.status == 202:
@@ -126,8 +125,8 @@ def check(
         counts["interrupted writes that were not"] += each.interrupted is not None and fitting[0] is each.state
         each.state, each.interrupted = fitting[0], None
     for path in calibrations:
-        assert server.poll(partial(_ended, server, path))["state"] == "succeeded"
-    server.poll(lambda: not [path for path in (data_dir / "calibrations").iterdir() if path.is_dir()])
+        assert ended_calibration(server, path)["state"] == "succeeded"
+    server.poll(lambda: not folders(data_dir))
     with closing(sqlite3.connect(data_dir / "camind.sqlite3")) as connection:
         assert connection.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
         assert connection.execute("PRAGMA foreign_key_check").fetchall() == []
@@ -162,16 +161,3 @@ def test_what_was_acknowledged_survives_kills(tmp_path: Path, tiny_model_dir: Pa
     print(f"{dict(counts)}")
     assert counts["acknowledged writes to cameras"] > 0
     assert counts["acknowledged calibrations"] > 0
-
-
-def _form() -> tuple[bytes, dict[str, str]]:
-    settings = (None, json.dumps({**SETTINGS, "register": True}), "application/json")
-    files: list[tuple[str, Any]] = [("settings", settings), ("defocused", ("a.png", png(corners()), "image/png"))]
-    request = Request("POST", "http://service/calibrate", files=files)
-    request.read()
-    return request.content, {"Content-Type": request.headers["content-type"]}
-
-
-def _ended(server: Server, path: str) -> dict[str, Any] | None:
-    body = server.ask("GET", path).json()
-    return None if body["state"] in ("queued", "running") else body

@@ -6,13 +6,11 @@ import threading
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import pytest
-from httpx2 import Request
 
 from model_export.served import Server, serving
-from tests.fake_calibration import SETTINGS
+from tests.fake_calibration import calibration_form
 from tests.held_server import GO, write_command
 from tests.inference.photographs import corners, jpeg, png
 
@@ -34,7 +32,7 @@ class Client:
         self._chance = random.Random(seed)
         self._camera = f"own-{seed}"
         self._photographs = [jpeg(corners(48 * scale, 64 * scale)) for scale in (1, 2, 4)]
-        self._form = _form()
+        self._form = calibration_form(png(corners()), register=True)
         self.statuses: Counter[str] = Counter()
 
     def send(self) -> None:
@@ -76,7 +74,7 @@ class Client:
         path, body, kind = self._chance.choice(
             (
                 ("/depth?camera=shared", self._photographs[2], "image/jpeg"),
-                ("/calibrate?camera=shared", self._form[0], self._form[1]),
+                ("/calibrate?camera=shared", self._form.content, self._form.headers["content-type"]),
             )
         )
         head = f"POST {path} HTTP/1.1\r\nHost: x\r\nContent-Type: {kind}\r\nContent-Length: {len(body)}\r\n\r\n"
@@ -85,16 +83,8 @@ class Client:
         return 0
 
     def _calibrate(self) -> int:
-        content, kind = self._form
-        return self._server.ask("POST", "/calibrate?camera=calibrated", content, {"Content-Type": kind}).status
-
-
-def _form() -> tuple[bytes, str]:
-    settings = (None, json.dumps({**SETTINGS, "register": True}), "application/json")
-    files: list[tuple[str, Any]] = [("settings", settings), ("defocused", ("a.png", png(corners()), "image/png"))]
-    request = Request("POST", "http://service/calibrate", files=files)
-    request.read()
-    return request.content, request.headers["content-type"]
+        headers = {"Content-Type": self._form.headers["content-type"]}
+        return self._server.ask("POST", "/calibrate?camera=calibrated", self._form.content, headers).status
 
 
 def held(server: Server) -> tuple[int, int, int]:

@@ -1,6 +1,5 @@
 """Two processes on one database and one spool take nothing from each other."""
 
-import json
 import signal
 import socket
 import time
@@ -15,8 +14,8 @@ import pytest
 from httpx2 import Request
 
 from model_export.served import Server, serving
-from tests.fake_calibration import SETTINGS
-from tests.held_server import GO, write_command
+from tests.fake_calibration import calibration_form
+from tests.held_server import GO, ended_calibration, folders, write_command
 from tests.inference.photographs import corners, png
 
 NAMES = 12
@@ -47,7 +46,7 @@ def servers(tmp_path: Path, data_dir: Path, tiny_model_dir: Path) -> Iterator[tu
 
     with start("first") as first:
         # its thread has taken the spool when this has ended
-        _ended(first, _post(first))
+        ended_calibration(first, _post(first))
         with start("second") as second:
             yield first, second
 
@@ -65,27 +64,27 @@ def test_a_name_is_given_once(servers: tuple[Server, Server]) -> None:
 
 def test_what_one_receives_the_other_does_not_sweep_away(servers: tuple[Server, Server], data_dir: Path) -> None:
     first, second = servers
-    request = form()
+    request = calibration_form(png(corners()))
     with _half_sent(second, request) as connection:
         second.poll(lambda: len(folders(data_dir)) == 1)
         received = folders(data_dir)
         # the first sweeps before it works, and removes its own folder once it has ended
-        _ended(first, _post(first))
+        ended_calibration(first, _post(first))
         first.poll(lambda: folders(data_dir) == received)
         connection.sendall(request.content[-10:])
         answer = connection.recv(65536)
     assert b" 202 " in answer
     path = answer.split(b"ocation: ")[1].split(b"\r\n")[0].decode()
-    assert _ended(first, path)["state"] == "succeeded"
+    assert ended_calibration(first, path)["state"] == "succeeded"
     first.poll(lambda: folders(data_dir) == [])
 
 
 def test_what_a_killed_one_was_receiving_is_swept_away(servers: tuple[Server, Server], data_dir: Path) -> None:
     first, second = servers
-    with closing(_half_sent(second, form())):
+    with closing(_half_sent(second, calibration_form(png(corners())))):
         second.poll(lambda: len(folders(data_dir)) == 1)
         second.stop(signal.SIGKILL)
-    _ended(first, _post(first))
+    ended_calibration(first, _post(first))
     first.poll(lambda: folders(data_dir) == [])
 
 
@@ -94,38 +93,15 @@ def test_the_other_goes_on_where_the_first_was_killed(servers: tuple[Server, Ser
     path = _post(first)
     first.stop(signal.SIGKILL)
     started_s = time.monotonic()
-    assert _ended(second, path)["state"] == "succeeded"
+    assert ended_calibration(second, path)["state"] == "succeeded"
     assert time.monotonic() - started_s < 30
     second.poll(lambda: folders(data_dir) == [])
 
 
-def form() -> Request:
-    picture = ("near.png", png(corners()), "image/png")
-    files: list[tuple[str, Any]] = [
-        ("settings", (None, json.dumps(SETTINGS), "application/json")),
-        ("defocused", picture),
-    ]
-    request = Request("POST", "http://service/calibrate", files=files)
-    request.read()
-    return request
-
-
-def folders(data_dir: Path) -> list[str]:
-    return [path.name for path in (data_dir / "calibrations").iterdir() if path.is_dir()]
-
-
 def _post(server: Server) -> str:
-    request = form()
+    request = calibration_form(png(corners()))
     headers = {"Content-Type": request.headers["content-type"]}
     return server.ask("POST", "/calibrate?camera=bench", request.content, headers).headers["location"]
-
-
-def _ended(server: Server, path: str) -> dict[str, Any]:
-    def look() -> dict[str, Any] | None:
-        body = server.ask("GET", path).json()
-        return None if body["state"] in ("queued", "running") else body
-
-    return server.poll(look)
 
 
 def _half_sent(server: Server, request: Request) -> socket.socket:
