@@ -1,7 +1,6 @@
 """Photographs of a printed grid to a camera's constants: find the circles, measure them, place the sheets, fit."""
 
 import math
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +20,6 @@ from service.errors import CamindError
 Array = NDArray[np.float64]
 Tell = Callable[[float, tuple[PictureReport, ...]], None]
 
-TELL_EVERY_S = 1.0
 FITTING_PART = 0.2  # of the progress
 BAD_VIEW = 4.0
 LEAST_BAD_PX = 1.5
@@ -53,49 +51,38 @@ class Task:
     method: Method = "edge"
 
 
-class _Teller:
-    """Says how far the work is, once a second, and lets it be stopped as often."""
-
-    def __init__(self, tell: Tell | None, check: Callable[[], None] | None) -> None:
-        self.tell, self.check = tell, check
-        self.told_at = -math.inf
-        self.reports: list[PictureReport] = []
-
-    def at(self, progress: float) -> None:
-        if self.check is not None:
-            self.check()
-        if self.tell is not None and time.monotonic() - self.told_at >= TELL_EVERY_S:
-            self.tell(progress, tuple(self.reports))
-            self.told_at = time.monotonic()
-
-
 def calibrate(
     task: Task,
     pictures: Sequence[Picture],
     *,
-    tell: Tell | None = None,
-    check: Callable[[], None] | None = None,
+    tell: Tell = lambda _progress, _reports: None,
+    check: Callable[[], None] = lambda: None,
 ) -> Report:
-    """Calibrate. ``tell(progress in 0..1, reports so far)`` is called about every second of work.
+    """Calibrate. ``tell(progress in 0..1, reports so far)`` is called circle by circle, and now and then in the fit.
 
-    ``check`` is called more often and may raise to stop the work; what it raises comes out. What is wrong with the
-    pictures is in the report, never raised. Focused ones come first, there too: their partners need them.
+    So is ``check``, which may raise to stop the work; what it raises comes out. What is wrong with the pictures is in
+    the report, never raised. Focused ones come first, there too: their partners need them.
     """
     pictures = sorted(pictures, key=lambda picture: picture.role != "focused")
-    teller = _Teller(tell, check)
     measured: list[Measured] = []
+    reports: list[PictureReport] = []
+
+    def told(progress: float) -> None:
+        check()
+        tell(progress, tuple(reports))
+
     with threadpool_limits(1, "blas"):  # the sums are small: more threads would wait for each other
         for number, picture in enumerate(pictures):
 
             def at(part: float, number: int = number) -> None:
-                teller.at((1 - FITTING_PART) * (number + part) / len(pictures))
+                told((1 - FITTING_PART) * (number + part) / len(pictures))
 
             at(0.0)
             one = _measured(task, picture, at, _partner(picture, measured))
             measured.append(one)
-            teller.reports.append(one.report)
+            reports.append(one.report)
         try:
-            result = _result(task, measured, lambda part: teller.at(1 - FITTING_PART + FITTING_PART * part))
+            result = _result(task, measured, lambda part: told(1 - FITTING_PART + FITTING_PART * part))
         except (PoseError, fit.FitError) as error:
             return Report(tuple(one.report for one in measured), None, str(error))
     return Report(tuple(one.report for one in measured), result, None)
