@@ -88,12 +88,13 @@ class Read:
         return down.astype(np.float32), across.astype(np.float32)
 
 
-def blend(maps: RawMaps, coarse: RawMaps, ratio: Ratio, strong_px: float) -> None:
+def blend(maps: RawMaps, coarse: RawMaps, ratio: Ratio, strong_px: float, *, by_coarse: bool = False) -> None:
     """Draw the maps [h, w] of a copy towards those of a smaller one, where both show strong blur.
 
     Not at all where either shows ``strong_px`` (in pixels of the larger copy), wholly where both show twice that, and
-    between in proportion to its logarithm: no step shows where one takes over. ``ratio`` is the smaller copy's size in
-    the larger one's. ``maps`` are written over.
+    between in proportion to its logarithm: no step shows where one takes over. ``by_coarse``: where the smaller one
+    does, whatever the larger one shows. ``ratio`` is the smaller copy's size in the larger one's. ``maps`` are written
+    over.
     """
     height, width = maps["blur_px"].shape
     # a copy's cells may cover half a cell less than there is
@@ -101,7 +102,7 @@ def blend(maps: RawMaps, coarse: RawMaps, ratio: Ratio, strong_px: float) -> Non
     for rows in bands((height, width)):
         told = {name: sample(values, ratio, rows, width) for name, values in wider.items()}
         told["blur_px"] /= np.float32(ratio.columns)
-        least_px = np.minimum(told["blur_px"], maps["blur_px"][rows])
+        least_px = told["blur_px"] if by_coarse else np.minimum(told["blur_px"], maps["blur_px"][rows])
         share = np.clip(log(least_px / np.float32(strong_px)) * OCTAVES, 0, 1)
         for name, values in maps.items():
             values[rows] += share * (told[name] - values[rows])

@@ -1,5 +1,6 @@
 """A photograph and its camera to depth: chooses the scale, reads, decides. No answer depends on another."""
 
+import math
 import weakref
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,7 +15,7 @@ from service.inference.copies import MAY_BE_SHARPER_PX, Read, blend
 from service.inference.depth_map import NO_ANSWER, DepthMap, Reading, all_layers, decide, fraction
 from service.inference.known import Clues, KnownDepth, around
 from service.inference.later import Later
-from service.inference.pair import SIDE_RANGES, GraphPair, RawMaps, Side, Sights, Stopwatch
+from service.inference.pair import SIDE_RANGES, GraphPair, Side, Sights, Stopwatch
 from service.inference.part import Part
 from service.inference.resampling import Ratio
 from service.inference.surroundings import settle
@@ -27,6 +28,7 @@ from service.optics.camera import Camera
 WELL_READ_K_CAM_PX = 12.0
 # of a picture larger than this the network sees too little at a time, and reads it as well where k_cam is this:
 WIDE_PX, FINE_K_CAM_PX = 640, 5.0
+LEAST_PX = 96  # the longer side of any such copy: of a smaller one nothing is left
 # what is as blurred as this part of the most that the model was trained on is read better on a copy of half the size,
 # where it is half as blurred and more of its surroundings is seen, and so on: table tops by k_cam 2.64 to 10.7 px
 # 0.105, 0.112, 0.103, 0.122 m, where it is 0.2 0.109, 0.116, 0.100, 0.127, indoor frames alike (docs/training.md)
@@ -91,6 +93,10 @@ class Estimator:
     def manifest(self) -> Manifest:
         return self._pair.manifest
 
+    @property
+    def _strong_px(self) -> float:
+        return STRONG_BLUR * self.manifest.ranges.blur_px.high
+
     def warm_up(self) -> None:
         """Answer one small grey picture, so that the first request does not pay for preparing the graphs."""
         grey = np.full((WARM_UP_PX, WARM_UP_PX, 3), 128, np.uint8)
@@ -150,7 +156,7 @@ class Estimator:
 
     def read(self, rgb: NDArray[np.uint8], camera: Camera, side: Side = "auto") -> Read:
         """What the networks answer, before it is decided what that means: for measuring them."""
-        return self._read_copies(_Request(rgb, camera, side), self._base_scale(camera))
+        return self._read_copies(_Request(rgb, camera, side))
 
     def _heard(self, request: _Request, known: Sequence[KnownDepth]) -> tuple[_Request, Clues | None]:
         """The request by the camera that known depths tell, and what else they do, of all that a small copy shows.
@@ -160,7 +166,7 @@ class Estimator:
         if not known:
             return request, None
         request = replace(request, part=request.part and around(known, request.part), sights=Sights())
-        scale = self._base_scale(request.camera)
+        scale = max(self._base_scale(request.camera), _finest_scale(request.camera))
         is_small = scale**2 * request.rgb.shape[0] * request.rgb.shape[1] <= SMALL_PX
         part = request.part if is_small else around(known)
         heard, read = self._read_sharp(replace(request, side="auto", part=part))
@@ -170,15 +176,14 @@ class Estimator:
 
     def _read_sharp(self, request: _Request) -> tuple[_Request, Read]:
         """What the copies show, and the request by a camera that can have taken what is sharp in them."""
-        scale = self._base_scale(request.camera)
-        read = self._read_copies(request, scale)
+        read = self._read_copies(request)
         gamma_px = read.sharper_gamma_px(self._blur_all_over(request, read))
         if gamma_px is None or _is_blank(request.rgb):
             return request, read
         camera, told_px = replace(request.camera, gamma_px=gamma_px), request.camera.gamma_px
         said = f"gamma_px taken as {gamma_px:.3g}, where {told_px:.3g} was told: the photograph is sharper than that"
         request = replace(request, camera=camera, warnings=(*request.warnings, said))
-        return request, self._read_copies(request, scale)
+        return request, self._read_copies(request)
 
     def _blur_all_over(self, request: _Request, read: Read) -> NDArray[np.float32]:
         """What the copy shows; where it is of a part, and the camera may be too soft, what places of the whole do."""
@@ -227,29 +232,44 @@ class Estimator:
     def _base_scale(self, camera: Camera) -> float:
         """The largest copy whose k_cam the model reads well, or a smaller one of a large picture; never enlarged."""
         at_most = min(WELL_READ_K_CAM_PX, self.manifest.ranges.k_cam_px.high) / camera.k_cam_px
-        longer_px = max(camera.image_width_px, camera.image_height_px)
-        return min(1.0, at_most, max(WIDE_PX / longer_px, FINE_K_CAM_PX / camera.k_cam_px))
+        least = LEAST_PX / max(camera.image_width_px, camera.image_height_px)
+        return min(1.0, max(at_most, least), max(_finest_scale(camera), FINE_K_CAM_PX / camera.k_cam_px))
 
-    def _read_copies(self, request: _Request, scale: float, smaller: int = SMALLER_COPIES) -> Read:
+    def _read_copies(self, request: _Request) -> Read:
+        """What copies of the photograph show: the one that suits its camera, smaller ones, larger ones.
+
+        Strong blur is read on smaller ones. What is so near focus that a large k_cam hardly blurs it, as a macro lens'
+        relief, is read on larger ones, each twice the size of the one before: where that shows little blur.
+        """
+        scale, finest = self._base_scale(request.camera), _finest_scale(request.camera)
+        read = self._read_coarsely(request, scale)
+        for larger in _doubling(scale, finest):
+            if fraction(read.maps["blur_px"] * (larger / scale) < self._strong_px / COARSER) <= STRONG_FRACTION:
+                break
+            read = self._blended(request, self._read_copy(request, larger), read, by_coarse=True)
+            scale = larger
+        return read
+
+    def _read_coarsely(self, request: _Request, scale: float, smaller: int = SMALLER_COPIES) -> Read:
         """What a copy of that scale shows, and for strong blur up to so many smaller ones."""
-        area = request.area(scale, self.manifest.multiple)
-        working = _copied(area.behind(request.camera), scale)
-        maps = self._read_copy(request, area, working, scale)
-        most_blur_px = self.manifest.ranges.blur_px.high
-        strong_px = STRONG_BLUR * most_blur_px
-        scales = (working.image_width_px / area.width_px,)
-        read = Read(maps, working, area, self.manifest.stride, scales, most_blur_px)
-        is_read_better = smaller > 0 and working.k_cam_px * COARSER >= self.manifest.ranges.k_cam_px.low
-        if not is_read_better or fraction(maps["blur_px"] > strong_px) <= STRONG_FRACTION:
+        read = self._read_copy(request, scale)
+        is_read_better = smaller > 0 and read.camera.k_cam_px * COARSER >= self.manifest.ranges.k_cam_px.low
+        if not is_read_better or fraction(read.maps["blur_px"] > self._strong_px) <= STRONG_FRACTION:
             return read
-        told = self._read_copies(request, scale * COARSER, smaller - 1)
+        return self._blended(request, read, self._read_coarsely(request, scale * COARSER, smaller - 1))
+
+    def _blended(self, request: _Request, read: Read, told: Read, *, by_coarse: bool = False) -> Read:
+        """What a copy shows, whose maps are written over, and where blur is strong what a smaller one does."""
         with request.stopwatch.stage("correct"):
             ratio = Ratio(*(small / large for small, large in zip(told.ratio, read.ratio, strict=True)))
-            blend(maps, told.maps_from(area), ratio, strong_px)
-        return replace(read, scales=read.scales + told.scales, most_blur_px=told.most_blur_px / COARSER)
+            blend(read.maps, told.maps_from(read.area), ratio, self._strong_px, by_coarse=by_coarse)
+        most_blur_px = told.most_blur_px * read.scales[0] / told.scales[0]
+        return replace(read, scales=read.scales + told.scales, most_blur_px=most_blur_px)
 
-    def _read_copy(self, request: _Request, area: Part, working: Camera, scale: float) -> RawMaps:
-        """The maps of a copy as large as that camera's pictures; the layout is seen where all of it is not too wide."""
+    def _read_copy(self, request: _Request, scale: float) -> Read:
+        """What a copy of that scale shows; the layout is seen where all of it is not too wide."""
+        area = request.area(scale, self.manifest.multiple)
+        working = _copied(area.behind(request.camera), scale)
         rgb, size = area.of(request.rgb), (working.image_width_px, working.image_height_px)
         copy = rgb if size == rgb.shape[1::-1] else cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
         whole_px = max(request.rgb.shape[:2]) * scale
@@ -265,18 +285,31 @@ class Estimator:
         )
         if is_wide:
             self._pair.lay_out(maps, WIDE_PX / whole_px, cancellation, stopwatch)
-        return maps
+        scales = (working.image_width_px / area.width_px,)
+        return Read(maps, working, area, self.manifest.stride, scales, self.manifest.ranges.blur_px.high)
 
     def _warnings(self, reading: Reading, *, whole: bool) -> list[str]:
         camera, scale, ranges = reading.camera, reading.scale, self.manifest.ranges
         size = f" ({camera.image_width_px}x{camera.image_height_px})" if whole else ""
         told = [] if scale == 1 else [f"read at {scale:.3g} of full size{size}"]
-        told += _outside("k_cam_px at that size", camera.k_cam_px, ranges.k_cam_px)
+        # however large k_cam is, there is a copy that suits it
+        k_cam_px = min(camera.k_cam_px, ranges.k_cam_px.high)
+        told += _outside("k_cam_px at that size", k_cam_px, ranges.k_cam_px)
         told += _outside("gamma_px at that size", camera.gamma_px, ranges.gamma_px)
         told += _outside("focus_distance_m", camera.focus_distance_m, ranges.focus_distance_m)
         if camera.intrinsics:
             told += _outside("fx_px at that size", camera.intrinsics.fx_px, ranges.focal_length_px)
         return told
+
+
+def _finest_scale(camera: Camera) -> float:
+    """The largest copy of which the network sees enough at a time; never enlarged."""
+    return min(1.0, WIDE_PX / max(camera.image_width_px, camera.image_height_px))
+
+
+def _doubling(scale: float, finest: float) -> list[float]:
+    """The scales above one, up to the finest, each twice the one before."""
+    return [finest * COARSER**step for step in reversed(range(math.ceil(math.log2(finest / scale))))]
 
 
 def _copied(camera: Camera, scale: float) -> Camera:
