@@ -16,8 +16,8 @@ from fastapi.concurrency import run_in_threadpool
 from limits import RateLimitItemPerMinute
 from limits.storage import MemoryStorage
 from limits.strategies import MovingWindowRateLimiter
-from starlette.datastructures import Headers
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.errors import CrossOrigin, Forbidden, QuotaExceeded, Unauthorized, UnknownHost
 from service.principal import ANYBODY, Principal
@@ -41,21 +41,63 @@ SCOPES_BY_PATH: dict[str, tuple[KeyScope | None, KeyScope | None]] = {
     "/calibrations": ("calibrate", "calibrate"),
     "/metrics": ("admin", "admin"),
 }
+CORS_HEADERS = {
+    "Access-Control-Allow-Methods": "GET, HEAD, POST, PUT, DELETE",
+    "Access-Control-Allow-Headers": "Authorization, Content-Type, If-Match, Idempotency-Key, Prefer, X-Request-Id",
+    "Access-Control-Expose-Headers": (
+        "ETag, Location, Preference-Applied, Retry-After, Server-Timing, WWW-Authenticate, X-Request-Id, "
+        "Camind-Camera, Camind-Camera-Revision, Camind-Depth-Scale-M, Camind-Focus-Distance-M, Camind-Model, "
+        "Camind-Warnings"
+    ),
+    "Access-Control-Max-Age": "600",
+}
 # what only reads, though it is sent
 SCOPES_OF_READING: dict[tuple[str, str], KeyScope] = {("POST", "/cameras/preview"): "cameras:read"}
+
+
+class AllowOrigins:
+    """Lets web pages of these origins read the answers (CORS), errors and what a browser asks beforehand included."""
+
+    def __init__(self, app: ASGIApp, *, origins: Collection[str]) -> None:
+        self._app = app
+        self._origins = frozenset(origins)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        origin = Headers(scope=scope).get("origin") if scope["type"] == "http" else None
+        if origin not in self._origins:
+            await self._app(scope, receive, send)
+            return
+
+        async def allowed(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                headers.update({"Access-Control-Allow-Origin": str(origin), **CORS_HEADERS})
+                headers.add_vary_header("Origin")
+            await send(message)
+
+        await self._app(scope, receive, allowed)
 
 
 class Authenticate:
     """Puts a ``Principal`` into the request's state: the key's owner, or ``ANYBODY`` where no key is asked for.
 
     Raises ``Unauthorized``, ``Forbidden`` and ``QuotaExceeded``; without keys ``CrossOrigin``, and ``UnknownHost`` for
-    another name than ``hosts`` and those that no stranger can have.
+    another name than ``hosts`` and those that no stranger can have. Pages of ``origins`` may do what the own one may.
     """
 
-    def __init__(self, app: ASGIApp, *, is_on: bool, requests_per_minute: int, hosts: Collection[str]) -> None:
+    def __init__(
+        self,
+        app: ASGIApp,
+        *,
+        is_on: bool,
+        requests_per_minute: int,
+        hosts: Collection[str],
+        origins: Collection[str],
+    ) -> None:
         self._app = app
         self._is_on = is_on
         self._hosts = frozenset(hosts)
+        self._origins = frozenset(origins)
         self._quota = RateLimitItemPerMinute(requests_per_minute) if requests_per_minute else None
         self._limiter = MovingWindowRateLimiter(MemoryStorage())
 
@@ -71,14 +113,16 @@ class Authenticate:
         headers = Headers(scope=scope)
         if not _is_below(scope["path"], HEALTH) and not is_own_name(headers.get("host", ""), self._hosts):
             raise UnknownHost("The service is not known by this name: add it to CAMIND_HOSTS, or serve with API keys.")
-        if scope["method"] not in READING and is_from_another_site(headers):
+        is_allowed = headers.get("origin") in self._origins
+        if scope["method"] not in READING and not is_allowed and is_from_another_site(headers):
             raise CrossOrigin("A page of another site asked for this; only the service's own page may.")
 
     async def _principal(self, scope: Scope) -> Principal:
-        if is_public(scope["path"]):
+        headers = Headers(scope=scope)
+        if is_public(scope["path"]) or _is_preflight(scope["method"], headers):
             return ANYBODY
         keys: Keys = scope["app"].state.keys
-        scheme, _, text = Headers(scope=scope).get("authorization", "").partition(" ")
+        scheme, _, text = headers.get("authorization", "").partition(" ")
         if scheme.lower() != "bearer":
             raise Unauthorized("Send an API key: Authorization: Bearer camind_...")
         key = await run_in_threadpool(keys.find, text.strip())
@@ -132,6 +176,11 @@ def is_own_name(host: str, hosts: Collection[str]) -> bool:
 def is_public(path: str) -> bool:
     """Whether the path answers without a key."""
     return path == PAGE or any(_is_below(path, prefix) for prefix in PUBLIC)
+
+
+def _is_preflight(method: str, headers: Headers) -> bool:
+    """Whether a browser asks what a page may ask: no key comes with that, and methods are all it is told."""
+    return method == "OPTIONS" and "access-control-request-method" in headers
 
 
 def needed_scope(method: str, path: str) -> KeyScope | None:

@@ -11,7 +11,7 @@ from fastapi import Depends, FastAPI
 from fastapi_offline import FastAPIOffline
 from threadpoolctl import threadpool_limits
 
-from service.access import Authenticate
+from service.access import AllowOrigins, Authenticate
 from service.api import (
     calibrations,
     cameras,
@@ -118,9 +118,11 @@ def _add_middleware(app: FastAPI, settings: Settings) -> None:
         is_on=settings.wants_keys,
         requests_per_minute=settings.key_requests_per_minute,
         hosts=settings.known_hosts,
+        origins=settings.known_origins,
     )
     app.add_middleware(AnswerHead)
     app.add_middleware(ObserveRequests, metrics=app.state.metrics, tracing=app.state.tracing)
+    app.add_middleware(AllowOrigins, origins=settings.known_origins)
 
 
 @asynccontextmanager

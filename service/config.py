@@ -82,6 +82,14 @@ class Settings(BaseSettings):
         ),
     ] = ""
 
+    origins: Annotated[
+        str,
+        Field(
+            pattern=r"^(https?://[\w.:\[\]-]+(, ?https?://[\w.:\[\]-]+)*)?$",
+            description="Origins, by commas, whose web pages may ask too: https://app.example.org",
+        ),
+    ] = ""
+
     workers: Annotated[int, Field(ge=0, le=64, description="Images worked on at a time; 0: cores / 2")] = 0
     intra_op_threads: Annotated[int, Field(ge=0, le=64, description="Threads per image; 0: cores / workers")] = 0
     queue_size: Annotated[int, Field(ge=0, le=1000, description="Images that may wait for a worker")] = 16
@@ -198,6 +206,11 @@ class Settings(BaseSettings):
     def known_hosts(self) -> frozenset[str]:
         """``hosts``, one by one."""
         return frozenset(name.strip().lower() for name in self.hosts.split(",") if name)
+
+    @property
+    def known_origins(self) -> frozenset[str]:
+        """``origins``, one by one."""
+        return frozenset(origin.strip().lower() for origin in self.origins.split(",") if origin)
 
     @property
     def is_loopback(self) -> bool:

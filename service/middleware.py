@@ -1,6 +1,7 @@
 """Around every request, in pure ASGI: an id, one log event, metrics, limits on what is received, HEAD.
 
-From the outside in: ``ObserveRequests``, ``AnswerHead``, ``access.Authenticate``, ``LimitRequests``, then the routes.
+From the outside in: ``access.AllowOrigins``, ``ObserveRequests``, ``AnswerHead``, ``access.Authenticate``,
+``LimitRequests``, then the routes.
 """
 
 import asyncio
@@ -89,19 +90,21 @@ class ObserveRequests:
         status = exchange.status or CLIENT_GONE
         path = getattr(scope.get("route"), "path", None)
         self._metrics.count(scope["method"], path, status, duration_s)
-        if PROBLEM_KEY in scope:
-            self._metrics.count_problem(scope[PROBLEM_KEY])
+        problem = scope.get(PROBLEM_KEY)
+        if problem is not None:
+            self._metrics.count_problem(problem)
         log.info(
             "request",
             method=scope["method"],
             path=path,
             status=status,
             duration_ms=round(duration_s * 1e3, 1),
+            **({"problem": problem} if problem else {}),
             **_camera(scope, path),
             **_key(scope),
         )
         if self._tracing is not None:
-            problem, stages_ms = scope.get(PROBLEM_KEY), scope.get(STAGES_KEY, {})
+            stages_ms = scope.get(STAGES_KEY, {})
             trace = Trace(exchange.request_id, scope["method"], path, status, duration_s, problem, stages_ms)
             self._tracing.record(trace, Headers(scope=scope))
 

@@ -398,3 +398,41 @@ def test_nobody_serves_others_without_keys_by_mistake(tmp_path: Path, tiny_model
     assert "camind keys create" in done.stderr
     assert "CAMIND_API_KEYS=off" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+ELSEWHERE = "https://app.example.org"
+ASKED_BEFOREHAND = {"Origin": ELSEWHERE, "Access-Control-Request-Method": "POST"}
+
+
+@pytest.mark.parametrize("origins", ["", f"https://other.example, {ELSEWHERE}"])
+def test_a_page_of_an_origin_that_is_named_may_ask_with_a_key_and_no_other(settings: Settings, origins: str) -> None:
+    is_named = bool(origins)
+    app = create_app(settings.model_copy(update={"origins": origins}), FakeCalibration())
+    with TestClient(app) as client:
+        beforehand = client.options("/depth", headers=ASKED_BEFOREHAND)
+        assert beforehand.status_code == 204
+        refusal = client.get("/cameras", headers={"Origin": ELSEWHERE})
+        refused(refusal, 401, "unauthorized")
+        allowed = client.get("/cameras", headers={"Origin": ELSEWHERE, **bearer(app.state.keys, "web")})
+        assert allowed.status_code == 200
+        for answer in (beforehand, refusal, allowed):
+            assert answer.headers.get("access-control-allow-origin") == (ELSEWHERE if is_named else None)
+            assert ("Origin" in answer.headers.get("vary", "")) == is_named
+        assert ("Authorization" in beforehand.headers.get("access-control-allow-headers", "")) == is_named
+        assert (
+            "access-control-allow-origin"
+            not in client.get("/cameras", headers={"Origin": "https://evil.example"}).headers
+        )
+        assert client.options("/depth", headers={"Origin": ELSEWHERE}).status_code == 401
+
+
+def test_without_keys_a_page_of_an_origin_that_is_named_may_change_things(settings: Settings) -> None:
+    open_to_all = settings.model_copy(update={"api_keys": "off", "origins": ELSEWHERE})
+    with TestClient(create_app(open_to_all, FakeCalibration())) as client:
+        headers = {"Origin": ELSEWHERE, "Sec-Fetch-Site": "cross-site"}
+        assert client.post("/cameras", json=CAMERA, headers=headers).status_code == 201
+        refused(
+            client.post("/cameras", json=CAMERA, headers=headers | {"Origin": "https://evil.example"}),
+            403,
+            "cross-origin",
+        )

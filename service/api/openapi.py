@@ -76,6 +76,10 @@ def _complete(operation: dict[str, Any]) -> None:
         for status, answer in responses(*BODY_ERRORS).items():
             operation["responses"].setdefault(str(status), answer)
     for answer in operation["responses"].values():
+        for content in answer.get("content", {}).values():
+            # OpenAPI 3.1 knows no items of a stream: the data of each is the whole calibration
+            if content.pop("itemSchema", None) is not None:
+                content["schema"] = {"$ref": REF.format(model="CalibrationRead")}
         answer.setdefault("headers", {})["X-Request-Id"] = REQUEST_ID_REF
 
 

@@ -6,6 +6,7 @@ from dataclasses import fields
 from typing import Annotated, Any
 
 from pydantic import BaseModel, Field, ValidationError
+from pydantic.json_schema import SkipJsonSchema
 from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
@@ -45,6 +46,10 @@ class ProblemField(BaseModel):
     detail: str
 
 
+def _without_default(schema: dict[str, Any]) -> None:
+    del schema["default"]  # what is left out is no null
+
+
 class Problem(BaseModel):
     """RFC 9457 problem details."""
 
@@ -52,7 +57,10 @@ class Problem(BaseModel):
     title: str
     status: int
     detail: Annotated[str, Field(description="What is wrong, and what to do")]
-    errors: Annotated[list[ProblemField] | None, Field(description="The fields at fault, if any")] = None
+    errors: Annotated[
+        list[ProblemField] | SkipJsonSchema[None],
+        Field(description="The fields at fault; left out where there are none", json_schema_extra=_without_default),
+    ] = None
 
 
 def problem(error: CamindError) -> Problem:

@@ -155,12 +155,17 @@ class CameraSpecs(Given):
         return lens.k_cam_px(self.focus_distance_m, self.image_width_px)
 
 
-# what to_draft asks for, said to programs
+# what to_draft asks for, said to programs by what it refuses: of a choice many make a type that lacks the other fields
 K_CAM_OR_LENS: dict[str, JsonValue] = {
-    "oneOf": [
-        {"required": ["k_cam_px"], "properties": {"k_cam_px": {"type": "number"}, "lens": {"type": "null"}}},
-        {"required": ["lens"], "properties": {"k_cam_px": {"type": "null"}, "lens": {"type": "object"}}},
-    ]
+    "not": {
+        "anyOf": [
+            {
+                "required": ["k_cam_px", "lens"],
+                "properties": {"k_cam_px": {"type": "number"}, "lens": {"type": "object"}},
+            },
+            {"properties": {"k_cam_px": {"type": "null"}, "lens": {"type": "null"}}},
+        ]
+    }
 }
 K_CAM_EXAMPLE: dict[str, JsonValue] = {
     "name": "pixel7-wide",
