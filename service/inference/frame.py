@@ -5,10 +5,12 @@ from collections.abc import Iterator
 from service.errors import ImageSizeMismatch
 from service.inference.exif import Exif
 from service.inference.images import TURNS, UNTURNS, Photograph
+from service.optics import thin_lens
 from service.optics.camera import Camera, Lens
 
 LENS_TOLERANCE = 0.05
 FOCUS_TOLERANCE = 0.15
+VIEW_TOLERANCE = 1.05
 MOST_ZOOM = 1.01
 
 
@@ -84,4 +86,16 @@ def _other_focus(exif: Exif, focus_distance_m: float) -> Iterator[str]:
         yield (
             f"its EXIF says that it was focused at {noted[0]:.4g} m, the camera at {focus_distance_m:.4g} m: "
             "send this shot's focus_distance_m"
+        )
+
+
+def maybe_seen_narrower(camera: Camera) -> Iterator[str]:
+    """A warning for what ``fx_px`` measures, where it follows from lens specs and the lens is focused close."""
+    if camera.focal_length_m is None:
+        return
+    longer = thin_lens.image_distance_in_focal_lengths(camera.focus_distance_m, camera.focal_length_m)
+    if longer > VIEW_TOLERANCE:
+        yield (
+            "fx_px is that of the lens focused far away; in one that moves as a whole it is "
+            f"{longer:.3g} times that, and points lie as much nearer to the axis: calibrate, or give intrinsics"
         )

@@ -190,6 +190,11 @@ def k_cam_at_focus(k_cam_px: float, focal_length_m: float, old_focus_m: float, n
     return k_cam_px * (old_focus_m - focal_length_m) / (new_focus_m - focal_length_m)
 
 
+def image_distance_in_focal_lengths(focus_distance_m: float, focal_length_m: float) -> float:
+    """s2 / f = s1 / (s1 - f), without unit: how far behind a thin lens the plane in focus has its image."""
+    return focus_distance_m / (focus_distance_m - focal_length_m)
+
+
 def focus_from_lens(focus_from_sensor_m: float, focal_length_m: float) -> float:
     """s1 in metres from the lens, where a ring or EXIF counts it from the sensor: s1 + s2 = D with 1/s1 + 1/s2 = 1/f.
 

@@ -238,21 +238,30 @@ def test_maps_are_aligned_with_the_photograph_to_a_fraction_of_a_pixel(estimator
     np.testing.assert_allclose(answer.blur_px[32, 2:-2], ramp[2:-2] / 255 * 10, atol=0.04)
 
 
-def test_a_large_k_cam_is_read_on_a_smaller_copy_and_reported(estimator: Estimator) -> None:
-    camera = Camera(600, 400, 2.0, 48.0, 0.5)
-    answer = estimator.estimate(grey(100, 400, 600), camera, "near")
-    assert answer.scales == (0.25,)
-    working_blur = blur_of(100)
-    x = thin_lens.relative_defocus_from_blur(working_blur, camera.averaged(150, 100).gamma_px, 12.0)
-    np.testing.assert_allclose(answer.depth_m, thin_lens.depth_near(x, 2.0), rtol=1e-4)
-    np.testing.assert_allclose(answer.blur_px, working_blur * 4, rtol=1e-4)
-    assert "read at 0.25 of full size (150x100)" in answer.warnings
-    assert answer.camera == camera
+@pytest.mark.parametrize(
+    ("width_px", "k_cam_px", "scales"),
+    [
+        (600, 48.0, (1, 0.5, 0.25)),
+        (640, 20.0, (1, 0.6)),
+        (1280, 96.0, (0.5, 0.25, 0.125)),
+        (1280, 2000.0, (0.5, 0.25, 0.125, 0.075)),
+    ],
+)
+def test_what_a_large_k_cam_hardly_blurs_is_read_on_larger_copies(
+    estimator: Estimator, width_px: int, k_cam_px: float, scales: tuple[float, ...]
+) -> None:
+    camera = Camera(width_px, width_px // 4, 2.0, k_cam_px, 0.5)
+    answer = estimator.estimate(grey(20, width_px // 4, width_px), camera, "near")
+    assert answer.scales == pytest.approx(scales, rel=0.02)
+    size = round(width_px * answer.scales[0]), round(width_px // 4 * answer.scales[0])
+    x = thin_lens.relative_defocus_from_blur(blur_of(20), camera.averaged(*size).gamma_px, k_cam_px * answer.scales[0])
+    np.testing.assert_allclose(answer.depth_m, thin_lens.depth_near(x, 2.0), rtol=1e-3)
+    assert not any("k_cam_px" in words for words in answer.warnings)
 
 
 @pytest.mark.parametrize(
     ("width_px", "k_cam_px", "scale"),
-    [(640, 7.5, 1.0), (1600, 7.5, 5 / 7.5), (1600, 20.0, 0.4), (1600, 1.3, 1.0), (1280, 48.0, 0.25)],
+    [(640, 7.5, 1.0), (1600, 7.5, 5 / 7.5), (1600, 20.0, 0.4), (1600, 1.3, 1.0), (2560, 48.0, 0.25)],
 )
 def test_of_a_large_picture_a_copy_is_read_that_shows_much_at_a_time_and_enough_blur(
     estimator: Estimator, width_px: int, k_cam_px: float, scale: float
@@ -277,6 +286,18 @@ def halving(tmp_path_factory: pytest.TempPathFactory) -> Estimator:
     """It knows blur to 20 px, so that of 3.4 px and more is read on a copy of half the size, and there alike."""
     folder = build_oracle_pair(tmp_path_factory.mktemp("model"), blur_range=Interval(0.3, 20.0))
     return Estimator.from_folder(load_model_folder(folder))
+
+
+def test_strong_blur_by_a_large_k_cam_is_read_on_smaller_copies_and_reported(halving: Estimator) -> None:
+    camera = Camera(1200, 800, 2.0, 96.0, 0.5)
+    answer = halving.estimate(grey(brightness_for(8.0), 800, 1200), camera, "near")
+    assert answer.scales == pytest.approx((0.125, 0.0625, 0.03125), rel=0.02)
+    working_blur, copy = blur_of(brightness_for(8.0)), camera.averaged(150, 100).averaged(75, 50).averaged(38, 25)
+    x = thin_lens.relative_defocus_from_blur(working_blur, copy.gamma_px, copy.k_cam_px)
+    np.testing.assert_allclose(answer.depth_m, thin_lens.depth_near(x, 2.0), rtol=0.01)
+    np.testing.assert_allclose(answer.blur_px, working_blur * 32, rtol=0.02)
+    assert "read at 0.125 of full size (150x100)" in answer.warnings
+    assert answer.camera == camera
 
 
 @pytest.mark.parametrize("size", [(64, 96), (63, 101), (50, 203)])
@@ -516,10 +537,10 @@ def test_what_optics_cannot_tell_has_no_answer(estimator: Estimator) -> None:
 
 
 def test_gamma_of_a_copy_is_told_for_the_photograph(estimator: Estimator) -> None:
-    picture = half_sharp(1.0).repeat(2, 0).repeat(2, 1)
-    answer = estimator.estimate(picture, Camera(192, 128, 2.0, 24.0, gamma_px=6.0), "near")
-    assert answer.scales[0] == 0.5
-    sharp_px = thin_lens.gamma_before_averaging(blur_of(brightness_for(1.0)), 192, 96)
+    picture = half_sharp(1.0).repeat(20, 0).repeat(20, 1)
+    answer = estimator.estimate(picture, Camera(1920, 1280, 2.0, 15.0, gamma_px=9.0), "near")
+    assert answer.scales[0] == pytest.approx(1 / 3)
+    sharp_px = thin_lens.gamma_before_averaging(blur_of(brightness_for(1.0)), 1920, 640)
     assert answer.camera.gamma_px == pytest.approx(sharp_px, rel=1e-3)
 
 

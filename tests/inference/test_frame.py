@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from service.errors import ImageSizeMismatch
 from service.inference.exif import Exif
-from service.inference.frame import camera_of, taken_otherwise
+from service.inference.frame import camera_of, maybe_seen_narrower, taken_otherwise
 from service.inference.images import TURNS, Photograph, turned
 from service.opencv import cv2
 from service.optics import thin_lens
@@ -123,6 +123,19 @@ def test_another_focus_than_the_camera_s_is_told_of_unless_it_came_with_the_phot
     assert len(said) == is_other
     assert all(f"focused at {noted_m:g} m, the camera at 2 m" in words for words in said)
     assert not [*taken_otherwise(exif, None, None)]
+
+
+@pytest.mark.parametrize(
+    ("focus_distance_m", "focal_length_m", "words"),
+    [(0.2, 0.05, "1.33 times"), (0.06, 0.025, "1.71 times"), (2.0, 0.05, ""), (0.2, None, "")],
+)
+def test_a_focal_length_that_close_focus_makes_longer_is_told_of(
+    focus_distance_m: float, focal_length_m: float | None, words: str
+) -> None:
+    camera = Camera(640, 480, focus_distance_m, 40.0, focal_length_m=focal_length_m)
+    said = [*maybe_seen_narrower(camera)]
+    assert len(said) == bool(words)
+    assert all(words in warning for warning in said)
 
 
 @pytest.mark.parametrize(

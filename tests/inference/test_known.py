@@ -173,15 +173,15 @@ def test_a_part_has_the_answers_of_the_whole_wherever_the_known_depths_are(estim
 
 
 def test_a_photograph_that_is_read_on_a_smaller_copy_has_the_same_answer(estimator: Estimator) -> None:
-    large = replace(TOLD, k_cam_px=24.0)
+    large = replace(TOLD, image_width_px=1280, image_height_px=853, k_cam_px=10.0)
     true = large.focused_at(1.8)
-    picture = np.empty((256, 384, 3), np.uint8)
-    picture[:, :192], picture[:, 192:] = (brightness_for(true.blur_px(z) / 2) for z in (1.3, 2.4))
-    known = [KnownDepth(60, 120, 1.3), KnownDepth(330, 40, 2.4)]
+    picture = np.empty((853, 1280, 3), np.uint8)
+    picture[:, :640], picture[:, 640:] = (brightness_for(true.blur_px(z) / 2) for z in (1.3, 2.4))
+    known = [KnownDepth(200, 400, 1.3), KnownDepth(1100, 133, 2.4)]
     answer = estimator.estimate(picture, large, "near", known=known)
     assert answer.scales[0] == pytest.approx(0.5, abs=0.05)
     assert answer.camera.focus_distance_m == pytest.approx(1.8, rel=0.03)
-    assert answer.depth_m[120, 60] == pytest.approx(1.3, rel=0.03)
+    assert answer.depth_m[400, 200] == pytest.approx(1.3, rel=0.03)
 
 
 @pytest.mark.parametrize("part", [None, Part(192, 128, 384, 256)])
