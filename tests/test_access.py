@@ -289,6 +289,16 @@ def test_a_key_has_its_own_quota(settings: Settings) -> None:
         assert client.get("/health/ready").status_code == 200
 
 
+def test_a_clock_that_is_set_back_keeps_nobody_out(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
+    app = create_app(settings.model_copy(update={"key_requests_per_minute": 3}))
+    with TestClient(app) as client:
+        key = bearer(app.state.keys, "robot")
+        assert [client.get("/cameras", headers=key).status_code for _ in range(4)] == [200, 200, 200, 429]
+        true_time = time.time
+        monkeypatch.setattr(time, "time", lambda: true_time() - 3600)
+        assert [client.get("/cameras", headers=key).status_code for _ in range(4)] == [200, 200, 200, 429]
+
+
 def test_a_body_is_not_received_for_nobody(client: TestClient) -> None:
     endless = (b"x" * 65536 for _ in range(1000))
     refused(client.post("/depth?camera=x", content=endless, headers={"Content-Type": "image/png"}), 401, "unauthorized")
