@@ -1,8 +1,8 @@
 """Where a lens is focused, and how sharp its pictures are there, from the blur of things whose depth is known."""
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from service.optics import thin_lens
@@ -19,7 +19,10 @@ SIDE_ERROR = 0.05
 TAIL = 2.5
 FARTHEST_OFF = 2.5
 # candidates over what was told, that itself first: what is farther off than they are need not be looked at
-FOCUS_RATIOS = tuple(FARTHEST_OFF ** (step / 100) for step in sorted(range(-100, 101), key=abs))
+FOCUS_STEP = math.log(FARTHEST_OFF) / 100
+FOCUS_RATIOS = tuple(math.exp(FOCUS_STEP * step) for step in sorted(range(-100, 101), key=abs))
+# what is likely is looked at in ever finer steps, until it is so many wide
+LEAST_STEPS, FINER_STEPS, MOST_PASSES = 10, 24, 4
 GAMMA_RATIOS = tuple(FARTHEST_OFF ** (step / 6) for step in sorted(range(-6, 7), key=abs))
 LEAST_BLUR_PX = 0.1
 CONFIDENCE_95 = 1.92  # half of the 95 % quantile of chi squared with one degree of freedom
@@ -63,23 +66,72 @@ def fit_focus(camera: Camera, sightings: Sequence[Sighting], is_near: bool | Non
     """
     if not sightings:
         raise ValueError("a focus distance is fitted to one known depth or more")
-    nearest_m = camera.focal_length_m or 0.0
-    distances_m = [m for m in (camera.focus_distance_m * ratio for ratio in FOCUS_RATIOS) if m > nearest_m]
-    best, possible = _Candidate(camera.focus_distance_m, 1.0, math.inf), []
-    for focus_m in distances_m:
-        for candidate in _candidates(camera, focus_m, sightings, is_near, best.loss + CONFIDENCE_95):
-            possible.append(candidate)
-            best = min(best, candidate, key=lambda each: each.loss)
-    likely_m = [each.focus_distance_m for each in possible if each.loss <= best.loss + CONFIDENCE_95]
+    search = _Search(camera, sightings, is_near, _Candidate(camera.focus_distance_m, 1.0, math.inf))
+    search.look(camera.focus_distance_m * ratio for ratio in FOCUS_RATIOS)
+    search.look(_suited(camera, sightings))
+    search.look_closer()
+    best, (low_m, high_m) = search.best, search.likely_m
     fitted = replace(camera.focused_at(best.focus_distance_m), gamma_px=camera.gamma_px * best.gamma_ratio)
     deviations = tuple(abs(seen.deviation(fitted.blur_px(seen.depth_m))) for seen in sightings)
-    return FocusFit(best.focus_distance_m, min(likely_m), max(likely_m), best.gamma_ratio, deviations)
+    return FocusFit(best.focus_distance_m, low_m, high_m, best.gamma_ratio, deviations)
 
 
 class _Candidate(NamedTuple):
     focus_distance_m: float
     gamma_ratio: float
     loss: float
+
+
+@dataclass(slots=True)
+class _Search:
+    """The likeliest candidate of those looked at, and the possible ones: not much less likely when they were seen."""
+
+    camera: Camera
+    sightings: Sequence[Sighting]
+    is_near: bool | None
+    best: _Candidate
+    possible: list[_Candidate] = field(default_factory=list)
+
+    @property
+    def likely_m(self) -> tuple[float, float]:
+        """The nearest and the farthest focus distance in the 95 % interval."""
+        most = self.best.loss + CONFIDENCE_95
+        likely_m = [each.focus_distance_m for each in self.possible if each.loss <= most]
+        return min(likely_m), max(likely_m)
+
+    def look(self, distances_m: Iterable[float]) -> None:
+        """Look at those focus distances that the lens can have and that are not too far from what was told."""
+        told_m = self.camera.focus_distance_m
+        low_m, high_m = max(told_m * FOCUS_RATIOS[-2], self.camera.focal_length_m or 0.0), told_m * FOCUS_RATIOS[-1]
+        for focus_m in distances_m:
+            if not low_m < focus_m <= high_m:
+                continue
+            most = self.best.loss + CONFIDENCE_95
+            for candidate in _candidates(self.camera, focus_m, self.sightings, self.is_near, most):
+                self.possible.append(candidate)
+                self.best = min(self.best, candidate, key=lambda each: each.loss)
+
+    def look_closer(self) -> None:
+        """Look at what is likely in finer steps: where k_cam is large, all of it may lie between two of the first."""
+        step = FOCUS_STEP
+        for _ in range(MOST_PASSES):
+            low_m, high_m = self.likely_m
+            width = math.log(high_m / low_m)
+            if width >= LEAST_STEPS * step:
+                return
+            start, step = math.log(low_m) - step, (width + 2 * step) / FINER_STEPS
+            self.look(math.exp(start + number * step) for number in range(1, FINER_STEPS))
+
+
+def _suited(camera: Camera, sightings: Sequence[Sighting]) -> Iterator[float]:
+    """The focus distances on either side of each thing whose blur there is what was read."""
+    focal_m = camera.focal_length_m or 0.0
+    k_near = camera.k_cam_px * (camera.focus_distance_m - focal_m)
+    for seen in sightings:
+        defocus_px = thin_lens.defocus_from_blur(seen.blur_px, camera.gamma_px)
+        for sigma_px in (defocus_px, -defocus_px):
+            if sigma_px * seen.depth_m < k_near:
+                yield seen.depth_m * (k_near - sigma_px * focal_m) / (k_near - sigma_px * seen.depth_m)
 
 
 def _candidates(

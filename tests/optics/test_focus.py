@@ -40,6 +40,16 @@ def test_what_is_in_focus_tells_gamma_and_what_is_not_the_focus_distance(gamma_p
     assert max(fit.deviations) < 2
 
 
+@pytest.mark.parametrize("true_m", [0.2009, 0.1991, 0.2027])
+def test_where_k_cam_is_large_the_focus_distance_is_found_as_finely_as_blur_tells_it(true_m: float) -> None:
+    told = Camera(1440, 1080, 0.2, 216.0, 0.6, focal_length_m=0.05)
+    fit = fitted(true_m, *(true_m * ratio for ratio in (0.98, 0.99, 0.995, 1.01)), told=told)
+    assert fit.focus_distance_m == pytest.approx(true_m, rel=2e-4)
+    assert fit.low_m < true_m < fit.high_m < 1.003 * fit.low_m
+    assert fit.gamma_ratio == 1
+    assert max(fit.deviations) < 0.5
+
+
 def test_things_out_of_focus_tell_no_gamma() -> None:
     true = replace(CAMERA, gamma_px=0.8)
     fit = fit_focus(CAMERA, [Sighting(depth_m, true.blur_px(depth_m), EXACT) for depth_m in (0.5, 0.8)])
