@@ -23,6 +23,8 @@ from service.opencv import cv2
 
 MILLIMETRE = 0.001
 LARGEST_MILLIMETRES = 65535
+FEW_MILLIMETRES, CLOSE_MILLIMETRES = 50, 500
+SAMPLES = 2**16
 UNDISTORTING = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-6)
 LENS_CELL_PX, MOST_OFF_PX = 8, 0.5
 PERCENTILES = (0, 5, 50, 95, 100)
@@ -81,7 +83,24 @@ def encode_png(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
         levels[rows] = millimetres
     body = grey_png(levels)
     lost = f"{beyond / levels.size:.1%} of the pixels lie beyond the 65.535 m a 16-bit PNG can hold and read 0"
-    return Encoded(body, MEDIA_TYPES["png"], MILLIMETRE, (lost,) if beyond else ())
+    warnings = (lost,) if beyond else _coarse(levels)
+    return Encoded(body, MEDIA_TYPES["png"], MILLIMETRE, warnings)
+
+
+def _coarse(levels: NDArray[np.uint16]) -> tuple[str, ...]:
+    """A warning where millimetres are few for what is close, by some of the pixels: all of them would take long."""
+    step = math.ceil(math.sqrt(levels.size / SAMPLES))
+    some = levels[::step, ::step]
+    known = some[some > 0]
+    if known.size == 0:
+        return ()
+    low, high = np.percentile(known, (5, 95))
+    if high > CLOSE_MILLIMETRES or high - low >= FEW_MILLIMETRES:
+        return ()
+    return (
+        f"nine tenths of the depths lie within {high - low:.0f} mm, and a 16-bit PNG holds whole millimetres: npy, npz "
+        "and tiff keep what is finer",
+    )
 
 
 def encode_npy(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:

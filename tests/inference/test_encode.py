@@ -78,6 +78,16 @@ def test_png_has_no_answer_beyond_what_it_can_hold_and_says_so(answer: DepthMap)
     assert "65.535 m" in encoded.warnings[0]
 
 
+def test_png_says_where_a_millimetre_is_coarse(answer: DepthMap) -> None:
+    said = "nine tenths of the depths lie within 8 mm, and a 16-bit PNG holds whole millimetres"
+    for nearest_m, relief_m, is_coarse in ((0.06, 0.01, True), (0.06, 0.1, False), (2.0, 0.01, False)):
+        answer.depth_m[:] = np.linspace(nearest_m, nearest_m + relief_m, 1200).reshape(30, 40)
+        warnings = encode_png(answer, RGB).warnings
+        assert [warning.startswith(said) for warning in warnings] == [True] * is_coarse
+    answer.valid[:] = False
+    assert encode_png(answer, RGB).warnings == ()
+
+
 def test_npy_and_tiff_hold_the_very_floats(answer: DepthMap) -> None:
     for pixels in (
         np.load(io.BytesIO(encode_npy(answer, RGB).body), allow_pickle=False),
