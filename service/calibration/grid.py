@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from service.calibration.target import LEAST_GAP_MM, CircleGrid, Kind
+from service.calibration.target import CircleGrid, Kind
 from service.opencv import cv2
 
 COARSEST_PX = 640
@@ -417,7 +417,7 @@ def _likeness(cells: dict[Cell, int], blobs: _Blobs, grid: CircleGrid) -> str:
     sizes = [size for size in sizes if size != given and min(size[1:]) >= 2]
     over = {(b, a): blob for (a, b), blob in cells.items()}  # axes may be named either way round, and are only turned
     for kind, rows, columns in sorted(sizes, key=lambda size: _unlikeness(size, given)):
-        other = CircleGrid(kind, rows, columns, 2 * LEAST_GAP_MM, LEAST_GAP_MM)
+        other = CircleGrid(kind, rows, columns, 2.0, 1.0)
         if any(_laid(lattice, blobs, _lattice_cells(other), other) for lattice in (cells, over)):
             return f"; it looks like {rows} rows, {columns} columns" + f" of {kind}" * (kind != grid.kind)
     return ""

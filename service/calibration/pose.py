@@ -20,7 +20,7 @@ FEW_VIEWS = 4
 LITTLE_TILT_DEG = 8.0
 BAD_RMS_PART = 0.008  # of the spacing
 FREE_VIEWS, CLEARLY = 6, 0.75
-TELL_BENT_MM = 0.5
+TELL_BENT_PART = 0.025  # of the spacing
 MOST_FOCAL_ERROR = 0.1
 CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-10)
 
@@ -101,7 +101,7 @@ def place(grid: CircleGrid, views: Sequence[View], size_px: tuple[int, int]) -> 
         tuple(solved.errors.tolist()),
         solved.rms,
         focal_error,
-        (*_warnings(grid, views, solved, tilts), *_imperfect(bent_mm)),
+        (*_warnings(grid, views, solved, tilts), *_imperfect(grid, bent_mm)),
     )
 
 
@@ -261,11 +261,11 @@ def _bias(board: Array, grid: CircleGrid, view: View, solved: _Solved, number: i
     return np.asarray(((outlines + after) * cross[..., None]).sum(1) / (3 * cross.sum(1))[:, None])
 
 
-def _imperfect(bent_mm: float) -> list[str]:
-    if bent_mm < TELL_BENT_MM:
+def _imperfect(grid: CircleGrid, bent_mm: float) -> list[str]:
+    if bent_mm < TELL_BENT_PART * grid.spacing_mm:
         return []
     return [
-        f"the sheet is bent or unevenly printed: circles are up to {bent_mm:.1f} mm off a flat, even grid; this is "
+        f"the sheet is bent or unevenly printed: circles are up to {bent_mm:.2g} mm off a flat, even grid; this is "
         "accounted for, but a flat sheet gives better distances"
     ]
 

@@ -20,7 +20,8 @@ MARGIN_MM = 10.0
 NOTES_MM = 32.0
 RULER_MM = 100
 MIDDLE_TICK_MM = 5
-LEAST_GAP_MM = 1.0
+LEAST_GAP_PART = 0.05  # of the spacing
+LEAST_PRINTED_GAP_MM = 1.0
 TEXT_MM = 3.2
 LINE_MM = 4.6
 THIN_MM = 0.2
@@ -50,14 +51,18 @@ class CircleGrid:
             raise ValueError("a grid has at least two rows and two columns")
         if not all(math.isfinite(v) and v > 0 for v in (self.spacing_mm, self.diameter_mm)):
             raise ValueError("spacing_mm and diameter_mm must be positive numbers")
-        gap_mm = self.nearest_mm - self.diameter_mm
-        if gap_mm < LEAST_GAP_MM:
+        if self.gap_mm < LEAST_GAP_PART * self.spacing_mm:
             raise ValueError(f"circles of {self.diameter_mm:g} mm that stand {self.nearest_mm:.3g} mm apart touch")
 
     @property
     def nearest_mm(self) -> float:
         """Distance between the centres of neighbours."""
         return self.spacing_mm * (math.sqrt(2) if self.kind == "asymmetric_circles" else 1.0)
+
+    @property
+    def gap_mm(self) -> float:
+        """The white between neighbours."""
+        return self.nearest_mm - self.diameter_mm
 
     def points_mm(self) -> NDArray[np.float64]:
         """Centres [rows * columns, 2], x right and y down, row by row from the first circle."""
@@ -95,8 +100,14 @@ class Sheet:
 def lay_out(grid: CircleGrid, paper: Paper) -> Sheet:
     """The grid in the middle of a sheet, upright or across, above a ruler and notes.
 
-    Raises ``ValueError`` that names the largest spacing that would fit.
+    Raises ``ValueError`` that names the largest spacing that would fit, or where ink would close what is between
+    circles.
     """
+    if grid.gap_mm < LEAST_PRINTED_GAP_MM:
+        raise ValueError(
+            f"circles {grid.gap_mm:.2g} mm from each other touch in print, where {LEAST_PRINTED_GAP_MM:g} mm is the "
+            "least: so fine a sheet is bought, and its calibration takes the same numbers"
+        )
     width, height = grid.size_mm
     for page in (PAPERS_MM[paper], PAPERS_MM[paper][::-1]):
         room = (page[0] - 2 * MARGIN_MM, page[1] - 2 * MARGIN_MM - NOTES_MM)
@@ -112,7 +123,7 @@ def _what_fits(grid: CircleGrid, paper: Paper) -> str:
         for page in (PAPERS_MM[paper], PAPERS_MM[paper][::-1])
     ]
     spacing_mm = math.floor(grid.spacing_mm * max(factors) * 10) / 10
-    if (grid.nearest_mm - grid.diameter_mm) / grid.spacing_mm * spacing_mm < LEAST_GAP_MM:
+    if grid.gap_mm / grid.spacing_mm * spacing_mm < LEAST_PRINTED_GAP_MM:
         return "nor does one whose circles do not touch: print fewer rows or columns"
     return f"at most {spacing_mm:.1f} mm spacing fits, with circles made smaller alike"
 

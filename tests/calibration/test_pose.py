@@ -23,17 +23,20 @@ def flat() -> Array:
 
 
 def views(
-    sheet: Array, count: int = 8, *, noise_px: float = 0.03, tilted: float = 1.0
+    sheet: Array, count: int = 8, *, noise_px: float = 0.03, tilted: float = 1.0, size: float = 1.0
 ) -> tuple[list[View], list[Array]]:
-    """The centres of the circles' outlines as photographs show them, and their true depths in metres."""
+    """The centres of the circles' outlines as photographs show them, and their true depths in metres.
+
+    Of a sheet of another ``size``, all is so much smaller or larger, the distances too.
+    """
     rng = np.random.default_rng(0)
     angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
-    rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(60)], 1) * GRID.diameter_mm / 2
+    rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(60)], 1) * size * GRID.diameter_mm / 2
     seen, depths = [], []
     for (a, b), depth_m in zip(TILTS[:count], DEPTHS_M[:count], strict=True):
         turn = np.array([tilted * a, tilted * b, 1.5])
         rotation = np.asarray(cv2.Rodrigues(turn)[0])
-        shift = np.array([5.0, -8.0, 1e3 * depth_m]) - rotation @ sheet.mean(0)
+        shift = size * np.array([5.0, -8.0, 1e3 * depth_m]) - rotation @ sheet.mean(0)
         outlines, _ = cv2.projectPoints((sheet[:, None] + rim).reshape(-1, 3), turn, shift, MATRIX, DISTORTION)
         ellipses = [cv2.fitEllipseDirect(rim_px.astype(np.float32)) for rim_px in outlines.reshape(-1, 60, 2)]
         centres = np.array([ellipse[0] for ellipse in ellipses]) + noise_px * rng.standard_normal((len(sheet), 2))
@@ -60,6 +63,15 @@ def test_depth_is_along_the_axis_and_not_along_the_ray() -> None:
     found = place(GRID, seen, SIZE)
     assert np.ptp(depths[0]) > 0.02, "the sheet is tilted"
     assert np.corrcoef(found.depth_m[0], depths[0])[0, 1] > 0.9999
+
+
+@pytest.mark.parametrize("size", [0.1, 1.0])
+def test_a_small_sheet_is_as_bent_as_a_large_one(size: float) -> None:
+    bent = flat()
+    bent[:, 2] = 2e-4 * (bent[:, 1] - bent[:, 1].mean()) ** 2  # 2 mm at the ends
+    grid = CircleGrid(GRID.kind, GRID.rows, GRID.columns, size * GRID.spacing_mm, size * GRID.diameter_mm)
+    found = place(grid, views(size * bent, size=size)[0], SIZE)
+    assert any("bent or unevenly printed" in warning for warning in found.warnings)
 
 
 def test_a_bent_and_stretched_sheet_is_found_and_said() -> None:

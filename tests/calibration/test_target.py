@@ -115,6 +115,12 @@ def test_a_grid_that_cannot_be_is_refused(kind: Kind, rows: int, spacing: float,
         CircleGrid(kind, rows, 5, spacing, diameter)
 
 
+def test_circles_a_third_of_a_millimetre_apart_are_a_sheet_of_glass_but_none_to_print() -> None:
+    fine = CircleGrid("symmetric_circles", 9, 9, 1.0, 0.7)
+    with pytest.raises(ValueError, match=r"0\.3 mm from each other touch in print"):
+        lay_out(fine, "a4")
+
+
 def test_a_grid_too_large_names_the_spacing_that_fits() -> None:
     grid = CircleGrid("symmetric_circles", 10, 10, 40.0, 30.0)
     with pytest.raises(ValueError, match="too large for a4") as caught:
