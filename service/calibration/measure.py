@@ -57,9 +57,10 @@ def otherwise_sized(measured: Sequence[Measured]) -> tuple[str, ...]:
     ]
     if not ratios or 1 / OTHER_SIZE <= (ratio := float(np.median(ratios))) <= OTHER_SIZE:
         return ()
+    linear = ", or the files hold linear light (gamma 1), where sRGB is expected" if ratio > 1 else ""
     return (
         f"the circles are {ratio:.3g} times as large, beside what is between them, as was told: one of spacing_mm and "
-        "diameter_mm is not the sheet's, and metres follow spacing_mm",
+        f"diameter_mm is not the sheet's, and metres follow spacing_mm{linear}",
     )
 
 

@@ -12,6 +12,7 @@ from service.calibration.measure import Measured, measure
 from service.calibration.report import PictureReport
 from service.calibration.target import CircleGrid
 from service.optics.camera import Intrinsics
+from service.optics.light import decode_srgb
 
 CAMERA = GridCamera(800, 600, 12.0, 0.7, 0.5, Intrinsics(900, 900, 400, 300))
 SHEETS = (CircleGrid("asymmetric_circles", 11, 4, 12.0, 8.0), CircleGrid("symmetric_circles", 6, 6, 22.0, 12.0))
@@ -42,6 +43,14 @@ def test_a_sheet_whose_circles_are_not_as_told_beside_their_spacing_is_noticed(
     )
     said = [warning for warning in look(taken, told, None).warnings if "one of spacing_mm and diameter_mm" in warning]
     assert [" 1.4" in warning for warning in said] == [True] * bool(wrong)
+
+
+def test_a_file_of_linear_light_is_said_to_be_one_perhaps() -> None:
+    rng = np.random.default_rng(3)
+    taken = photograph(rng, CAMERA, draw_pose(rng, CAMERA, SHEETS[0], 0.38), SHEETS[0], focused=False)
+    linear = np.rint(230 * decode_srgb(taken.astype(np.float32) / 255)).astype(np.uint8)
+    assert "linear light" in " ".join(look(linear, SHEETS[0], None).warnings)
+    assert "linear light" not in " ".join(look(taken, SHEETS[0], None).warnings)
 
 
 @pytest.mark.parametrize("level", [251, 235, None])
