@@ -82,13 +82,24 @@ def _focus_m(exif: Exif, warnings: list[str]) -> float | None:
     if distance_m is None or not FOCUS_DISTANCES_M[0] <= distance_m <= FOCUS_DISTANCES_M[1]:
         warnings.append("its EXIF does not say where the lens was focused: focus_distance_m is needed")
         return None
-    focus_m = exif.focus_from_lens_m
-    from_lens = f" and counted from the sensor, {focus_m:.4g} m from the lens" if focus_m else ""
     warnings.append(
-        f"focused at {distance_m:g} m as the camera reports it, which is often coarse{from_lens}: better measure from "
-        "the lens to what is sharpest"
+        f"focused at {distance_m:g} m as the camera reports it, which is often coarse{_from_lens(exif, distance_m)}: "
+        "better measure from the lens to what is sharpest"
     )
     return distance_m
+
+
+def _from_lens(exif: Exif, distance_m: float) -> str:
+    """What the distance would be from the lens; about that where a lens of its focal length could not be so near."""
+    focal_length_m = (exif.focal_length_mm or math.inf) / 1e3
+    if focus_m := exif.focus_from_lens_m:
+        return f" and counted from the sensor, {focus_m:.4g} m from the lens"
+    if distance_m > focal_length_m:
+        return (
+            f" and counted from the sensor, much less from the lens (at 1:1, {2 * focal_length_m:.4g} m with "
+            f"{exif.focal_length_mm:g} mm, or less where the lens shortens it)"
+        )
+    return ""
 
 
 def _zoom(exif: Exif) -> float:

@@ -190,6 +190,8 @@ def test_where_it_was_focused_is_taken_with_care() -> None:
 def test_a_ring_counts_from_the_sensor_and_the_draft_says_what_that_is_from_the_lens() -> None:
     assert said(draft(focal_length_mm=35.0, subject_distance_m=2.0), "from the sensor", "1.964 m from the lens")
     assert said(draft(focal_length_mm=100.0, subject_distance_m=0.5), "0.3618 m from the lens")
+    macro = draft(focal_length_mm=100.0, subject_distance_m=0.3)
+    assert said(macro, "from the sensor, much less from the lens", "at 1:1, 0.2 m with 100 mm")
     for unknown in (draft(focal_length_mm=None, subject_distance_m=2.0), draft(subject_distance_m=0.01)):
         assert not said(unknown, "from the sensor")
 
