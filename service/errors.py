@@ -61,6 +61,11 @@ class CamindError(Exception):
         return {}
 
 
+def known_codes(base: type[CamindError] = CamindError) -> frozenset[str]:
+    """The codes of all errors there are, of those that other modules define too."""
+    return frozenset({base.code}).union(*(known_codes(error) for error in base.__subclasses__()))
+
+
 class BadRequest(CamindError):
     status = 422
     code = "invalid-request"

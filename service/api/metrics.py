@@ -18,7 +18,7 @@ from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector
 
 from service.api.problems import responses
-from service.errors import CamindError
+from service.errors import CamindError, known_codes
 from service.inference.worker import Worker
 from service.storage.calibrations import LIVE, Calibrations
 
@@ -91,6 +91,8 @@ class Metrics:
         self._problems = Counter(
             "camind_problems", "Answers that refuse, by the problem's code", ("code",), registry=self.registry
         )
+        for code in sorted(known_codes()):
+            self._problems.labels(code)  # a series that began at 1 would hide the first one from increase()
         self.in_progress = Gauge("camind_requests_in_progress", "Requests being answered", registry=self.registry)
 
     def watch(self, parts: Parts | None) -> None:

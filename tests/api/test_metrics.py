@@ -110,13 +110,18 @@ def test_refusals_are_counted_by_code_alone(client: TestClient, phone: dict[str,
     found = {
         labels: value
         for (name, labels), value in figures(client.get("/metrics").text).items()
-        if name == "camind_problems_total"
+        if name == "camind_problems_total" and value
     }
     assert found == {
         (("code", errors.NotFound.code),): 3,
         (("code", errors.BadRequest.code),): 1,
         (("code", errors.TooLarge.code),): 1,
     }
+
+
+@pytest.mark.parametrize("code", ["internal-error", "busy", "invalid-image"])
+def test_every_problem_is_counted_from_0_so_that_the_first_is_an_increase(client: TestClient, code: str) -> None:
+    assert figure(client, "camind_problems_total", code=code) == 0
 
 
 def test_what_is_no_http_is_counted_and_the_process_is_measured(tmp_path: Path, tiny_model_dir: Path) -> None:
@@ -126,6 +131,7 @@ def test_what_is_no_http_is_counted_and_the_process_is_measured(tmp_path: Path, 
             assert connection.recv(100).startswith(b"HTTP/1.1 400")
         found = figures(server.ask("GET", "/metrics").body.decode())
     assert found["camind_problems_total", (("code", "malformed-request"),)] == 1
+    assert found["camind_problems_total", (("code", "headers-too-large"),)] == 0
     assert 30e6 < found["process_resident_memory_bytes", ()] < 2e9
     assert 0 < found["process_open_fds", ()] < found["process_max_fds", ()]
     assert found["camind_model_info", (("name", "oracle-20260101"),)] == 1
