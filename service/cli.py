@@ -355,19 +355,26 @@ def delete_camera(name: CameraName, owner: Owner = LOCAL) -> None:
 
 
 def _camera(engine: Engine, owner: str, name: str) -> "CameraRecord":
-    from service.storage.cameras import Cameras
+    from service.storage.cameras import Cameras, camera_counts
 
     try:
         return Cameras(engine, owner).get(name)
     except NotFound as exc:
         told = "camind cameras list names those there are, camind cameras add stores one"
-        raise _failure(f"There is no camera '{name[:64]}': {told}.") from exc
+        others = _of_others(camera_counts(engine, name))
+        raise _failure(f"There is no camera '{name[:64]}'{others}: {told}.") from exc
+
+
+def _of_others(counts: dict[str, int]) -> str:
+    """Who else has cameras, to be said after a sentence that there is none."""
+    owners = ", ".join(f"{count} of {owner}" for owner, count in counts.items())
+    return f" of this owner, but {owners} (--owner)" if owners else ""
 
 
 @cameras_app.command(name="list")
 def list_cameras(owner: Owner = LOCAL) -> None:
     """Print name, revision, k_cam, focus distance and image size, a camera a line."""
-    from service.storage.cameras import Cameras
+    from service.storage.cameras import Cameras, camera_counts
 
     with _plain_failures(), _ready_engine() as engine:
         cameras, after, has_more = Cameras(engine, owner), None, True
@@ -376,6 +383,8 @@ def list_cameras(owner: Owner = LOCAL) -> None:
             for record in records:
                 typer.echo(_line_of(record))
             after = records[-1].name if records else None
+        if after is None and (others := _of_others(camera_counts(engine))):
+            typer.echo(f"There is no camera{others}.", err=True)
 
 
 def _line_of(record: "CameraRecord") -> str:

@@ -252,6 +252,21 @@ def test_a_camera_is_shown_as_what_stores_it_and_replaced_and_deleted(known_by: 
         assert "There is no camera 'other': camind cameras list" in gone.stderr
 
 
+@pytest.mark.usefixtures("bench")
+def test_cameras_of_another_owner_are_told_of_where_one_s_own_are_missed() -> None:
+    for name in ("front", "rear"):
+        told = json.dumps({**BENCH, "name": name})
+        assert at_once("cameras", "add", "--owner", "robot", "-", said=told).exit_code == 0
+    assert at_once("cameras", "list").stderr == ""
+    assert at_once("cameras", "delete", "bench").exit_code == 0
+    listed = at_once("cameras", "list")
+    assert (listed.exit_code, listed.stdout) == (0, "")
+    assert listed.stderr == "There is no camera of this owner, but 2 of robot (--owner).\n"
+    missed = at_once("cameras", "show", "rear").stderr
+    assert missed.startswith("There is no camera 'rear' of this owner, but 1 of robot (--owner): ")
+    assert at_once("cameras", "show", "re\x00ar").stderr.startswith("There is no camera 're")
+
+
 def test_a_photograph_in_which_nothing_is_seen_has_no_depth(bench: Path) -> None:
     cv2.imwrite(str(bench / "black.png"), np.zeros((48, 64, 3), np.uint8))
     told = at_once("depth", "black.png", "--camera", "bench")

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Literal, get_args
 
-from sqlalchemy import BindParameter, Engine, bindparam
+from sqlalchemy import BindParameter, Engine, bindparam, func
 from sqlmodel import Session, col, select
 from sqlmodel.sql.expression import Select
 
@@ -147,6 +147,18 @@ class Cameras:
             if once:
                 note(session, self._owner, once, str(record.revision))
             return record
+
+
+def camera_counts(engine: Engine, name: str | None = None) -> dict[str, int]:
+    """How many cameras each owner has, of that ``name`` where one is given; owners without any are left out."""
+    owner = col(CameraRow.owner)
+    query = select(owner, func.count()).where(col(CameraRow.deleted_at).is_(None))
+    if name is not None:
+        if not _is_name(name):
+            return {}
+        query = query.where(col(CameraRow.name) == name)
+    with reading(engine) as session:
+        return dict(session.exec(query.group_by(owner).order_by(owner)).all())
 
 
 def require_name(name: str) -> None:
