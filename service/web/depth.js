@@ -30,6 +30,7 @@ import { html, useCallback, useEffect, useMemo, useRef, useState } from "./vendo
  * @property {File} file
  * @property {Facts} facts
  * @property {Blob} npz
+ * @property {number} focusM the focus distance that was used
  * @property {string[]} warnings
  * @property {[string, number][]} timings the service's stages in milliseconds
  * @property {string} model
@@ -176,6 +177,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 				file: sent,
 				facts,
 				npz: answer.body,
+				focusM: Number(answer.headers.get("Camind-Focus-Distance-M")),
 				warnings: (answer.headers.get("Camind-Warnings") ?? "").split("; ").filter(Boolean),
 				timings: readTimings(answer.headers.get("Server-Timing") ?? ""),
 				model: answer.headers.get("Camind-Model") ?? "",
@@ -330,7 +332,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 						html`<div class="stack depth-side-panel">
 							${result &&
 							html`<${Warnings} texts=${warned("result")} />
-								<${Readout} reading=${reading} />
+								<${Readout} reading=${reading} focusM=${result.focusM} />
 								<${Distance} ...${{ marks, measured }} hasPoints=${result.facts.hasPoints} onClear=${() => setMarks([])} />`}
 							<${Tape} mark=${marks.at(-1) ?? null} known=${known} onKnown=${setKnown} />
 							${result &&

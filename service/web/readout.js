@@ -9,9 +9,8 @@ export function metres(value) {
 
 /** @typedef {import("./maps.js").Reading} Reading */
 
-/** @param {{reading: Reading | null}} props */
-export function Readout({ reading }) {
-	const [side, likelihood] = reading ? sideOf(reading) : ["", 0];
+/** @param {{reading: Reading | null, focusM: number}} props */
+export function Readout({ reading, focusM }) {
 	return html`<section class="card stack depth-readout" aria-label="Under the pointer">
 		<h3>Under the pointer</h3>
 		${reading === null
@@ -25,14 +24,14 @@ export function Readout({ reading }) {
 					</p>
 					<dl class="facts">
 						<dt>Side</dt>
-						<dd>${reading.depthM === null ? "–" : `${side}, ${percent(likelihood)}`}</dd>
+						<dd data-value="side">${reading.depthM === null ? "–" : sideOf(reading.depthM, reading, focusM)}</dd>
 						<dt>Or else</dt>
 						<dd data-value="other">
 							${reading.depthM === null
 								? "–"
 								: reading.otherM === null
 									? "no other distance fits"
-									: `${metres(reading.otherM)}, ${percent(1 - likelihood)}`}
+									: `${metres(reading.otherM)}, ${percent(reading.otherM < focusM ? reading.pNear : 1 - reading.pNear)}`}
 						</dd>
 						<dt>Blur</dt>
 						<dd data-value="blur">${reading.blurPx.toFixed(2)} px</dd>
@@ -95,10 +94,21 @@ export function Timings({ timings, model }) {
 	</details>`;
 }
 
-/** @param {Reading} reading @returns {[string, number]} the side that the answer is on, and how likely that is */
-function sideOf({ depthM, otherM, pNear }) {
-	const isNear = depthM !== null && otherM !== null ? depthM < otherM : pNear >= 0.5;
-	return isNear ? ["nearer than focus", pNear] : ["beyond focus", 1 - pNear];
+/**
+ * The side that the answer is on, and how likely that is; both sides, where neither is chosen: where the depth is drawn
+ * beyond its own side, or that side is the less likely one.
+ *
+ * @param {number} depthM
+ * @param {Reading} reading
+ * @param {number} focusM
+ */
+function sideOf(depthM, { otherM, pNear }, focusM) {
+	const isNear = depthM < focusM;
+	const isDrawnOver = otherM !== null && otherM < focusM === isNear;
+	if (isDrawnOver || (isNear ? pNear : 1 - pNear) < 0.5) {
+		return `in doubt: nearer than focus ${percent(pNear)}, beyond it ${percent(1 - pNear)}`;
+	}
+	return isNear ? `nearer than focus, ${percent(pNear)}` : `beyond focus, ${percent(1 - pNear)}`;
 }
 
 /** @param {number} share */

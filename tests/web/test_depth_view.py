@@ -181,6 +181,36 @@ def test_three_actions_lead_to_metres_and_they_are_the_services(
         assert told.startswith(f"{other:.3f} m" if np.isfinite(other) else "no other")
 
 
+def test_the_side_that_is_said_is_that_of_the_metres(measured: Page, maps: Callable[..., Any]) -> None:
+    depth_m, other_m, p_near = (maps()[name].ravel() for name in ("depth_m", "depth_alt_m", "p_near"))
+    is_near = depth_m < 2
+    is_drawn_over = is_near == (other_m < 2)
+    share = np.where(is_near, p_near, 1 - p_near)
+    answered = np.isfinite(other_m)
+    kinds = {
+        r"nearer than focus, (\d+)": answered & is_near & ~is_drawn_over & (share > 0.6),
+        r"beyond focus, (\d+)": answered & ~is_near & ~is_drawn_over & (share > 0.6),
+        r"in doubt: nearer than focus \d+.%, beyond it (\d+)": answered & is_near & ~is_drawn_over & (share < 0.45),
+        r"in doubt: nearer than focus (?:\d+).%, beyond it (\d+)": answered & is_drawn_over,
+    }
+    picture = stage(measured)
+    for said, kind in kinds.items():
+        v, u = divmod(int(np.flatnonzero(kind)[np.count_nonzero(kind) // 2]), 645)
+        picture.hover(position=place_of(picture, u, v))
+        expect(measured.locator("[data-value=pixel]")).to_have_text(f"{u}, {v}")
+        side = measured.locator("[data-value=side]")
+        expect(side).to_have_text(re.compile(rf"^{said}.%$"))
+        told = re.fullmatch(rf"{said}.%", side.inner_text())
+        p = p_near[v * 645 + u]
+        assert told is not None
+        assert int(told[1]) == pytest.approx(100 * (p if said.startswith("nearer") else 1 - p), abs=0.6)
+        other = other_m[v * 645 + u]
+        of_other = 100 * (p if other < 2 else 1 - p)
+        other_told = re.fullmatch(r"([\d.]+) m, (\d+).%", measured.locator("[data-value=other]").inner_text())
+        assert other_told is not None
+        assert [float(number) for number in other_told.groups()] == pytest.approx([other, of_other], abs=0.6)
+
+
 def test_two_points_have_the_distance_that_their_pixels_say(measured: Page, maps: Callable[..., Any]) -> None:
     picture, known = stage(measured), maps()
     ends = ((100, 300), (520, 180))
