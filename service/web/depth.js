@@ -192,7 +192,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 			}
 			announce(
 				spread
-					? `Depth is ready: ${spread.nearM.toFixed(2)} to ${spread.farM.toFixed(2)} metres.`
+					? `Depth is ready: ${spread.nearM.toFixed(2)} to ${spread.farM.toFixed(2)} metres along the axis.`
 					: "The photograph gives no answer.",
 			);
 		} catch (error) {
@@ -334,7 +334,12 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 							html`<${Warnings} texts=${warned("result")} />
 								<${Readout} reading=${reading} focusM=${result.focusM} />
 								<${Distance} ...${{ marks, measured }} hasPoints=${result.facts.hasPoints} onClear=${() => setMarks([])} />`}
-							<${Tape} mark=${marks.at(-1) ?? null} known=${known} onKnown=${setKnown} />
+							<${Tape}
+								...${{ reader, known }}
+								mark=${marks.at(-1) ?? null}
+								hasPoints=${result?.facts.hasPoints ?? false}
+								onKnown=${setKnown}
+							/>
 							${result &&
 							html`<${Colours} look=${look} facts=${result.facts} onLook=${setLook} />
 								<${Exports} key=${result.model + JSON.stringify(result.asked)} result=${result} announce=${announce} />

@@ -16,6 +16,8 @@ import { readNpz } from "./npy.js";
  * @property {number | null} sigmaM
  * @property {number} pNear
  * @property {number} blurPx
+ * @property {number | null} rayLength metres straight from the lens per metre of depth along its axis; null where the
+ *   camera's focal length is not known
  */
 
 /**
@@ -121,6 +123,7 @@ export class DepthMaps {
 			sigmaM: known(this.sigmaM[pixel]),
 			pNear: this.pNear[pixel],
 			blurPx: this.blurPx[pixel],
+			rayLength: known(Math.hypot(...this.ray(u, v))),
 		};
 	}
 

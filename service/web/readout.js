@@ -20,9 +20,13 @@ export function Readout({ reading, focusM }) {
 						${reading.depthM === null
 							? "No answer here"
 							: html`<strong data-value="depth">${metres(reading.depthM)}</strong>${" "}
-									<span data-value="sigma">± ${metres(reading.sigmaM ?? 0)}</span>`}
+									<span data-value="sigma">± ${metres(reading.sigmaM ?? 0)}</span> along the axis`}
 					</p>
 					<dl class="facts">
+						${reading.depthM !== null &&
+						reading.rayLength !== null &&
+						html`<dt>Straight</dt>
+							<dd><span data-value="straight">${metres(reading.depthM * reading.rayLength)}</span> from the lens</dd>`}
 						<dt>Side</dt>
 						<dd data-value="side">${reading.depthM === null ? "–" : sideOf(reading.depthM, reading, focusM)}</dd>
 						<dt>Or else</dt>

@@ -242,7 +242,7 @@ function Marks({ size, reading, marks, measured, known }) {
 			isBelow=${reading.v < 0.85 * size.height}
 			name="reading"
 		>
-			${reading.depthM === null ? "no answer" : `${metres(reading.depthM)} ± ${metres(reading.sigmaM ?? 0)}`}
+			${reading.depthM === null ? "no answer" : `${metres(reading.depthM)} ± ${metres(reading.sigmaM ?? 0)} along the axis`}
 		<//>`}
 		${to &&
 		measured !== null &&
@@ -287,7 +287,8 @@ function usePaintPx(stage, size) {
 }
 
 /** @param {Reading} reading */
-function spoken({ u, v, depthM, sigmaM }) {
+function spoken({ u, v, depthM, sigmaM, rayLength }) {
 	if (depthM === null) return `No answer at ${u}, ${v}.`;
-	return `${depthM.toFixed(3)} metres, give or take ${(sigmaM ?? 0).toFixed(3)}, at ${u}, ${v}.`;
+	const straight = rayLength === null ? "" : ` Straight from the lens ${(depthM * rayLength).toFixed(3)} metres.`;
+	return `${depthM.toFixed(3)} metres along the axis, give or take ${(sigmaM ?? 0).toFixed(3)}, at ${u}, ${v}.${straight}`;
 }

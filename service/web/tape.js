@@ -2,35 +2,44 @@
 
 import { decimal } from "./numbers.js";
 import { metres } from "./readout.js";
-import { TextField } from "./text_field.js";
+import { Choice, TextField } from "./text_field.js";
 import { html, useRef, useState } from "./vendor/preact.js";
 
 /** @typedef {{u: number, v: number, depthM: number}} KnownDepth */
+
+const WAYS = [
+	["axis", "Along the lens' axis"],
+	["straight", "Straight from the lens"],
+];
 
 const NEAREST_M = 0.001;
 const FARTHEST_M = 99_999;
 
 /**
  * @param {{
+ *   reader: import("./reader.js").DepthReader,
  *   mark: import("./depth.js").Pixel | null,
+ *   hasPoints: boolean,
  *   known: KnownDepth[],
  *   onKnown: (known: KnownDepth[]) => void,
  * }} props
  */
-export function Tape({ mark, known, onKnown }) {
+export function Tape({ reader, mark, hasPoints, known, onKnown }) {
 	const [text, setText] = useState("");
 	const [fault, setFault] = useState("");
+	const [way, setWay] = useState("axis");
 	const title = useRef(/** @type {HTMLHeadingElement | null} */ (null));
 
 	/** @param {Event} event */
-	function add(event) {
+	async function add(event) {
 		event.preventDefault();
-		const depthM = decimal(text);
+		if (mark === null) return;
+		const isStraight = hasPoints && way === "straight";
+		const depthM = decimal(text) / (isStraight ? ((await reader.ask("at", mark)).rayLength ?? NaN) : 1);
 		if (!(depthM >= NEAREST_M && depthM <= FARTHEST_M)) {
 			setFault("This is no distance in metres.");
 			return;
 		}
-		if (mark === null) return;
 		const others = known.filter(({ u, v }) => u !== mark.u || v !== mark.v);
 		setText("");
 		setFault("");
@@ -51,19 +60,20 @@ export function Tape({ mark, known, onKnown }) {
 						kind="decimal"
 						value=${text}
 						fault=${fault}
-						hint="Along the lens' axis."
+						hint=${hasPoints ? "" : "Along the lens' axis."}
 						onInput=${(/** @type {string} */ typed) => {
 							setText(typed);
 							setFault("");
 						}}
 					/>
+					${hasPoints && html`<${Choice} label="Measured" value=${way} options=${WAYS} onChange=${setWay} />`}
 					<div class="row"><button>Use it</button></div>
 				</form>`}
 		${known.length > 0 &&
 		html`<ul class="depth-known">
 			${known.map(
 				(one) => html`<li class="row ends" key=${`${one.u},${one.v}`}>
-					<span>${metres(one.depthM)} at ${one.u}, ${one.v}</span>
+					<span>${metres(one.depthM)} along the axis at ${one.u}, ${one.v}</span>
 					<button
 						type="button"
 						aria-label=${`Forget ${metres(one.depthM)} at ${one.u}, ${one.v}`}

@@ -10,6 +10,7 @@ from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import parse_qs, urlsplit
 
 import cv2
 import matplotlib
@@ -177,6 +178,10 @@ def test_three_actions_lead_to_metres_and_they_are_the_services(
         blur = page.locator("[data-value=blur]").inner_text()
         assert float(blur.removesuffix(" px")) == pytest.approx(known["blur_px"][v, u], abs=0.006)
         other = known["depth_alt_m"][v, u]
+        straight = np.linalg.norm(np.linalg.inv(known["K"]) @ (u, v, 1)) * known["depth_m"][v, u]
+        assert number_in(page, "straight") == pytest.approx(straight, abs=0.0006)
+        expect(page.get_by_role("region", name="Under the pointer")).to_contain_text("along the axis")
+        expect(page.locator("[data-label=reading]")).to_contain_text("along the axis")
         told = page.locator("[data-value=other]").inner_text()
         assert told.startswith(f"{other:.3f} m" if np.isfinite(other) else "no other")
 
@@ -394,6 +399,22 @@ def test_what_a_tape_says_moves_the_focus_and_can_be_forgotten(
     expect(known.get_by_role("heading")).to_be_focused()
     reads("")
     expect(measured.locator(".depth-taped")).to_have_count(0)
+
+
+def test_a_tape_may_be_held_straight_from_the_lens(measured: Page, maps: Callable[..., Any]) -> None:
+    picture, (u, v) = stage(measured), (600, 31)
+    picture.click(position=place_of(picture, u, v))
+    known = measured.get_by_role("region", name="Known by a tape")
+    known.get_by_label("Measured").select_option("Straight from the lens")
+    known.get_by_label(f"From the lens to {u}, {v} in m").fill("2.5")
+    with measured.expect_request(lambda request: "known=" in request.url) as asked:
+        known.get_by_role("button", name="Use it").click()
+    depth_m = 2.5 / np.linalg.norm(np.linalg.inv(maps()["K"]) @ (u, v, 1))
+    told = parse_qs(urlsplit(asked.value.url).query)["known"][0].split(",")
+    assert [float(number) for number in told] == pytest.approx([u, v, depth_m], abs=1e-4)
+    assert depth_m < 2.499
+    expect(known.get_by_role("listitem")).to_contain_text(f"{depth_m:.3f} m along the axis at {u}, {v}")
+    stage(measured)
 
 
 def test_after_a_failed_reading_one_may_forget_a_depth_or_read_again(
