@@ -103,6 +103,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 		setReading(null);
 		setMarks([]);
 		setKnown([]);
+		setSide("auto");
 		forgetFocus();
 		setPhotograph(null);
 		setIsOpening(true);

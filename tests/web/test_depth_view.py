@@ -365,6 +365,12 @@ def test_another_side_or_focus_is_read_again_and_so_is_what_was_measured(
         expect(measured.locator("[data-value=pixel]")).to_have_text("322, 216")
         assert number_in(measured, "depth") == pytest.approx(maps(query)["depth_m"][216, 322], abs=0.0006)
         expect(measured.locator("[data-label=distance]")).to_have_text(re.compile(r"^\d\.\d{3} m ± \d\.\d{3} m$"))
+    # of another photograph neither is known
+    with measured.expect_request(re.compile(r"/depth\?camera=d200&format=npz$")):
+        give(measured)
+    stage(measured)
+    expect(side).to_have_value("auto")
+    expect(focus).to_have_value("")
 
 
 def test_what_a_tape_says_moves_the_focus_and_can_be_forgotten(
