@@ -2,7 +2,18 @@
 
 import { Problem, getJson, problemOf, sendJson, storeCamera } from "./api.js";
 import { CameraCurve } from "./camera_curve.js";
-import { BLANK, SENSOR_WIDTH, bodyOf, differences, fieldsOf, filledIn, missingOf, numbersOf } from "./camera_specs.js";
+import {
+	BLANK,
+	SENSOR_WIDTH,
+	bodyOf,
+	differences,
+	fieldsOf,
+	filledIn,
+	missingOf,
+	numbersOf,
+	refocusedKCam,
+} from "./camera_specs.js";
+import { short } from "./numbers.js";
 import { PHOTOGRAPHS, mediaTypeOf } from "./photograph_files.js";
 import { ProblemBox, Warnings, useProblem } from "./problem_box.js";
 import { Table } from "./table.js";
@@ -27,6 +38,7 @@ export function arriveAt(heading) {
 export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 	const [base, setBase] = useState(editing);
 	const [fields, setFields] = useState(/** @type {Fields} */ (editing ? fieldsOf(editing) : BLANK));
+	const [held, setHeld] = useState(/** @type {{k_cam_px: number, focus_distance_m: number} | null} */ (editing));
 	const [problem, setProblem] = useProblem();
 	const [told, setTold] = useState(/** @type {string[]} */ ([]));
 	const [theirs, setTheirs] = useState(/** @type {any | null} */ (null));
@@ -35,6 +47,7 @@ export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 	const title = useRef(/** @type {HTMLHeadingElement | null} */ (null));
 	const faults = [...unclear(fields), ...previewFaults, ...(problem?.errors ?? [])];
 	const missing = missingOf(fields);
+	const refocused = refocusedKCam(fields, held);
 
 	useEffect(() => arriveAt(title.current), []);
 
@@ -117,6 +130,7 @@ export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 					setTheirs(null);
 					setBase(theirs);
 					setFields(fieldsOf(theirs));
+					setHeld(theirs);
 				}}
 			/>`}
 			<${ProblemBox} problem=${problem} />
@@ -154,6 +168,21 @@ export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 				: html`<div class="pair">
 						${field("k_cam_px", "k_cam (px)", { hint: "blur per unit of relative defocus, at the image width" })}
 					</div>`}
+			${held &&
+			refocused &&
+			html`<p class="notice" role="status">
+				This k_cam holds at a focus distance of ${short(held.focus_distance_m, 4)} m; at ${short(refocused.focusM, 4)} m it is
+				${" "}${short(refocused.kCamPx, 4)}.${" "}
+				<button
+					type="button"
+					onClick=${() => {
+						setHeld({ k_cam_px: refocused.kCamPx, focus_distance_m: refocused.focusM });
+						change({ k_cam_px: String(refocused.kCamPx) });
+					}}
+				>
+					Use ${short(refocused.kCamPx, 4)}
+				</button>
+			</p>`}
 			<details>
 				<summary>More: gamma, intrinsics, description</summary>
 				<div class="pair">

@@ -1,6 +1,6 @@
 /** A camera between its forms: what the API answers, what it takes, and the fields a person fills in. */
 
-import { decimal } from "./numbers.js";
+import { decimal, toMetres } from "./numbers.js";
 
 /** @typedef {Record<string, string>} Fields by the pointer's path: "lens/f_number" */
 
@@ -106,6 +106,21 @@ export function bodyOf(fields) {
 export function missingOf(fields) {
 	const needed = { ...NEEDED, ...(fields.by === "lens" ? NEEDED_OF_LENS : { "k_cam_px": "k_cam" }) };
 	return Object.entries(needed).flatMap(([path, words]) => ((fields[path] ?? "").trim() ? [] : [words]));
+}
+
+/**
+ * k_cam at the focus distance that is filled in, where it stands as it holds at another one: the focal length, which is
+ * not known, is taken to be far below either.
+ *
+ * @param {Fields} fields
+ * @param {{k_cam_px: number, focus_distance_m: number} | null} held
+ * @returns {{focusM: number, kCamPx: number} | null} null where there is nothing to change
+ */
+export function refocusedKCam(fields, held) {
+	const focusM = toMetres(fields.focus_distance_m ?? "");
+	if (!held || !focusM || fields.by !== "k_cam" || fields.k_cam_px !== String(held.k_cam_px)) return null;
+	if (focusM === held.focus_distance_m) return null;
+	return { focusM, kCamPx: Number(((held.k_cam_px * held.focus_distance_m) / focusM).toPrecision(6)) };
 }
 
 /**

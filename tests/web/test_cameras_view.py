@@ -88,6 +88,24 @@ def test_a_fault_is_shown_at_its_field(page: Page, expected_errors: list[str]) -
     expect(page.get_by_label("Focal length (mm)")).to_have_accessible_description(re.compile("cannot focus at 2 m"))
 
 
+def test_k_cam_is_moved_with_the_focus_distance(page: Page, served: Server, phone: dict[str, Any]) -> None:
+    open_camera(page, served, phone)
+    page.get_by_role("button", name="Edit", exact=True).click()
+    k_cam, focus = page.get_by_label("k_cam (px)"), page.get_by_label("Focus distance (m)")
+    told = page.get_by_text("This k_cam holds at a focus distance of")
+    expect(k_cam).to_have_value(f"{phone['k_cam_px']:g}")
+    for focus_distance_m in (phone["focus_distance_m"] / 2, phone["focus_distance_m"] / 4):
+        expect(told).to_have_count(0)
+        focus.fill(f"{focus_distance_m:g}")
+        expect(told).to_contain_text(f"at {focus_distance_m:g} m it is")
+        told.get_by_role("button").click()
+        moved = phone["k_cam_px"] * phone["focus_distance_m"] / focus_distance_m
+        expect(k_cam).to_have_value(f"{moved:.6g}")
+    page.get_by_role("button", name="Save as a new revision").click()
+    expect(page.get_by_text("revision 2", exact=True)).to_be_visible()
+    assert read(served, phone["name"])["k_cam_px"] == pytest.approx(moved, rel=1e-5)
+
+
 @pytest.mark.parametrize(
     ("typed", "numbers"),
     [
