@@ -1,7 +1,7 @@
 /** Which colours the depth has, from where to where, and what is marked on it. */
 
 import { MAPS } from "./colours.js";
-import { toMetres } from "./numbers.js";
+import { inMetres, toMetres } from "./numbers.js";
 import { Choice } from "./text_field.js";
 import { html, useState } from "./vendor/preact.js";
 
@@ -48,13 +48,13 @@ function Bound({ title, value, leastM, mostM, onValue }) {
 			max=${STEPS}
 			value=${Math.round((STEPS * Math.log(value / leastM)) / span)}
 			aria-label=${`${title} end of the colours`}
-			aria-valuetext=${`${value.toFixed(2)} metres`}
+			aria-valuetext=${`${inMetres(value)} metres`}
 			onInput=${(/** @type {any} */ event) => onValue(leastM * Math.exp((span * event.target.value) / STEPS))}
 		/>
 		<input
 			type="text"
 			inputmode="decimal"
-			value=${typed ?? value.toFixed(3)}
+			value=${typed ?? inMetres(value)}
 			aria-label=${`${title} end of the colours, metres`}
 			onInput=${(/** @type {any} */ event) => setTyped(event.target.value)}
 			onChange=${(/** @type {any} */ event) => {

@@ -25,7 +25,7 @@ export function depthPath({ camera, side, focusM, known, format }) {
 	const query = new URLSearchParams({ camera });
 	if (side !== "auto") query.set("side", side);
 	if (focusM !== null) query.set("focus_distance_m", String(focusM));
-	for (const { u, v, depthM } of known) query.append("known", `${u},${v},${Number(depthM.toFixed(4))}`);
+	for (const { u, v, depthM } of known) query.append("known", `${u},${v},${Number(depthM.toPrecision(9))}`);
 	query.set("format", format);
 	return `depth?${query}`;
 }

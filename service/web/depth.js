@@ -8,11 +8,11 @@ import { Colours } from "./colour_controls.js";
 import { DraftForm } from "./draft_form.js";
 import { Exports } from "./exports.js";
 import { Legend } from "./legend.js";
-import { short, toMetres } from "./numbers.js";
+import { inMetres, short, toMetres, withError } from "./numbers.js";
 import { PHOTOGRAPHS, mediaTypeOf, readShown } from "./photograph_files.js";
 import { ProblemBox, Warnings, useProblem } from "./problem_box.js";
 import { DepthReader } from "./reader.js";
-import { Distance, Readout, Timings, metres } from "./readout.js";
+import { Distance, Readout, Timings } from "./readout.js";
 import { Stage } from "./stage.js";
 import { Tape } from "./tape.js";
 import { Choice, TextField } from "./text_field.js";
@@ -129,7 +129,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 		reader.ask("distance", { from: marks[0], to: marks[1] }).then((distance) => {
 			if (!isWanted) return;
 			setMeasured(distance ?? "unknown");
-			if (distance) announce(`The points are ${metres(distance.distanceM)} apart.`);
+			if (distance) announce(`The points are ${withError(distance.distanceM, distance.sigmaM)} apart.`);
 		});
 		return () => {
 			isWanted = false;
@@ -193,7 +193,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 			}
 			announce(
 				spread
-					? `Depth is ready: ${spread.nearM.toFixed(2)} to ${spread.farM.toFixed(2)} metres along the axis.`
+					? `Depth is ready: ${inMetres(spread.nearM)} to ${inMetres(spread.farM)} metres along the axis.`
 					: "The photograph gives no answer.",
 			);
 		} catch (error) {

@@ -1,6 +1,7 @@
 /** What the colours mean: a bar with ticks in metres, how often each occurs, and the two patterns. */
 
 import { colourTable, placeOf } from "./colours.js";
+import { inMetres, short } from "./numbers.js";
 import { logTicks, ticksOf } from "./ticks.js";
 import { html, useEffect, useRef } from "./vendor/preact.js";
 
@@ -18,15 +19,13 @@ export function Legend({ look, counts }) {
 		}
 		context.putImageData(pixels, 0, 0);
 	}, [map]);
-	const decimals = farM - nearM < 0.2 ? 3 : farM - nearM < 2 ? 2 : 1;
-	const written = (/** @type {number} */ depthM) => String(Number(depthM.toFixed(decimals + 1)));
-	return html`<figure class="depth-legend" aria-label=${`Colours: ${nearM.toFixed(2)} m near to ${farM.toFixed(2)} m far`}>
+	return html`<figure class="depth-legend" aria-label=${`Colours: ${inMetres(nearM)} m near to ${inMetres(farM)} m far`}>
 		${counts && html`<${Histogram} counts=${counts} />`}
 		<canvas ref=${bar} width="256" height="1" aria-hidden="true"></canvas>
 		<div class="depth-ticks" aria-hidden="true">
 			${(farM / nearM < 4 ? ticksOf : logTicks)(nearM, farM).map(
 				(depthM) =>
-					html`<span key=${depthM} style=${{ left: `${100 * placeOf(depthM, nearM, farM)}%` }}>${written(depthM)}</span>`,
+					html`<span key=${depthM} style=${{ left: `${100 * placeOf(depthM, nearM, farM)}%` }}>${short(depthM, 6)}</span>`,
 			)}
 		</div>
 		<figcaption class="row hint">

@@ -1,5 +1,8 @@
 /** Numbers as people read them. */
 
+const CLOSE_M = 0.5;
+const CLOSE_DIGITS = 4;
+
 /** @param {number | null | undefined} value @param {number} [digits] significant ones @returns {string} a dash for none */
 export function short(value, digits = 3) {
 	if (value === null || value === undefined || !Number.isFinite(value)) return "–";
@@ -9,6 +12,17 @@ export function short(value, digits = 3) {
 /** @param {number | null} value @param {string} unit with the space before it, where there is one @param {number} [digits] */
 export function measure(value, unit, digits = 3) {
 	return value === null ? "–" : short(value, digits) + unit;
+}
+
+/** Metres to a millimetre, close things to four digits. @param {number} value @param {number} [like] that it has as many decimals as */
+export function inMetres(value, like = value) {
+	const isClose = like > 0 && like < CLOSE_M;
+	return value.toFixed(isClose ? CLOSE_DIGITS - 1 - Math.floor(Math.log10(like)) : 3);
+}
+
+/** @param {number} depthM @param {number | null} sigmaM */
+export function withError(depthM, sigmaM) {
+	return `${inMetres(depthM)} m ± ${inMetres(sigmaM ?? 0, depthM)} m`;
 }
 
 /** @param {number} count @param {string} one @param {string} [many] */

@@ -1,11 +1,7 @@
 /** What the answer says in words: at the pointer, between two points, and how long it took. */
 
+import { inMetres } from "./numbers.js";
 import { html, useRef } from "./vendor/preact.js";
-
-/** To a millimetre. @param {number} value */
-export function metres(value) {
-	return `${value.toFixed(3)} m`;
-}
 
 /** @typedef {import("./maps.js").Reading} Reading */
 
@@ -19,14 +15,14 @@ export function Readout({ reading, focusM }) {
 			: html`<p class="depth-metres">
 						${reading.depthM === null
 							? "No answer here"
-							: html`<strong data-value="depth">${metres(reading.depthM)}</strong>${" "}
-									<span data-value="sigma">± ${metres(reading.sigmaM ?? 0)}</span> along the axis`}
+							: html`<strong data-value="depth">${inMetres(reading.depthM)} m</strong>${" "}
+									<span data-value="sigma">± ${inMetres(reading.sigmaM ?? 0, reading.depthM)} m</span> along the axis`}
 					</p>
 					<dl class="facts">
 						${reading.depthM !== null &&
 						reading.rayLength !== null &&
 						html`<dt>Straight</dt>
-							<dd><span data-value="straight">${metres(reading.depthM * reading.rayLength)}</span> from the lens</dd>`}
+							<dd><span data-value="straight">${inMetres(reading.depthM * reading.rayLength)} m</span> from the lens</dd>`}
 						<dt>Side</dt>
 						<dd data-value="side">${reading.depthM === null ? "–" : sideOf(reading.depthM, reading, focusM)}</dd>
 						<dt>Or else</dt>
@@ -35,7 +31,7 @@ export function Readout({ reading, focusM }) {
 								? "–"
 								: reading.otherM === null
 									? "no other distance fits"
-									: `${metres(reading.otherM)}, ${percent(reading.otherM < focusM ? reading.pNear : 1 - reading.pNear)}`}
+									: `${inMetres(reading.otherM)} m, ${percent(reading.otherM < focusM ? reading.pNear : 1 - reading.pNear)}`}
 						</dd>
 						<dt>Blur</dt>
 						<dd data-value="blur">${reading.blurPx.toFixed(2)} px</dd>
@@ -69,8 +65,8 @@ export function Distance({ marks, measured, hasPoints, onClear }) {
 		<h3 tabindex="-1" ref=${title}>Distance in space</h3>
 		${measured !== null && measured !== "unknown"
 			? html`<p class="depth-metres">
-					<strong data-value="distance">${metres(measured.distanceM)}</strong>${" "}
-					<span data-value="distance-sigma">± ${metres(measured.sigmaM)}</span>
+					<strong data-value="distance">${inMetres(measured.distanceM)} m</strong>${" "}
+					<span data-value="distance-sigma">± ${inMetres(measured.sigmaM, measured.distanceM)} m</span>
 				</p>`
 			: html`<p class="hint">${says()}</p>`}
 		${marks.length > 0 &&

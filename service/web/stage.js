@@ -1,6 +1,6 @@
 /** The photograph under its depth, with the divider between them, the pointer's reading and the two marks. */
 
-import { metres } from "./readout.js";
+import { inMetres, withError } from "./numbers.js";
 import { latest } from "./reader.js";
 import { html, useEffect, useMemo, useRef, useState } from "./vendor/preact.js";
 
@@ -242,7 +242,7 @@ function Marks({ size, reading, marks, measured, known }) {
 			isBelow=${reading.v < 0.85 * size.height}
 			name="reading"
 		>
-			${reading.depthM === null ? "no answer" : `${metres(reading.depthM)} ± ${metres(reading.sigmaM ?? 0)} along the axis`}
+			${reading.depthM === null ? "no answer" : `${withError(reading.depthM, reading.sigmaM)} along the axis`}
 		<//>`}
 		${to &&
 		measured !== null &&
@@ -253,7 +253,7 @@ function Marks({ size, reading, marks, measured, known }) {
 			isBelow=${from.v + to.v < 0.3 * size.height}
 			name="distance"
 		>
-			${metres(measured.distanceM)} ± ${metres(measured.sigmaM)}
+			${withError(measured.distanceM, measured.sigmaM)}
 		<//>`}
 	`;
 }
@@ -289,6 +289,6 @@ function usePaintPx(stage, size) {
 /** @param {Reading} reading */
 function spoken({ u, v, depthM, sigmaM, rayLength }) {
 	if (depthM === null) return `No answer at ${u}, ${v}.`;
-	const straight = rayLength === null ? "" : ` Straight from the lens ${(depthM * rayLength).toFixed(3)} metres.`;
-	return `${depthM.toFixed(3)} metres along the axis, give or take ${(sigmaM ?? 0).toFixed(3)}, at ${u}, ${v}.${straight}`;
+	const straight = rayLength === null ? "" : ` Straight from the lens ${inMetres(depthM * rayLength)} metres.`;
+	return `${inMetres(depthM)} metres along the axis, give or take ${inMetres(sigmaM ?? 0, depthM)}, at ${u}, ${v}.${straight}`;
 }

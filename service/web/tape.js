@@ -1,7 +1,6 @@
 /** What somebody has measured in the picture: depths that the service is told, and answers the rest by. */
 
-import { decimal } from "./numbers.js";
-import { metres } from "./readout.js";
+import { decimal, inMetres } from "./numbers.js";
 import { Choice, TextField } from "./text_field.js";
 import { html, useRef, useState } from "./vendor/preact.js";
 
@@ -73,10 +72,10 @@ export function Tape({ reader, mark, hasPoints, known, onKnown }) {
 		html`<ul class="depth-known">
 			${known.map(
 				(one) => html`<li class="row ends" key=${`${one.u},${one.v}`}>
-					<span>${metres(one.depthM)} along the axis at ${one.u}, ${one.v}</span>
+					<span>${inMetres(one.depthM)} m along the axis at ${one.u}, ${one.v}</span>
 					<button
 						type="button"
-						aria-label=${`Forget ${metres(one.depthM)} at ${one.u}, ${one.v}`}
+						aria-label=${`Forget ${inMetres(one.depthM)} m at ${one.u}, ${one.v}`}
 						onClick=${() => {
 							onKnown(known.filter((other) => other !== one));
 							title.current?.focus();

@@ -236,6 +236,33 @@ def test_two_points_have_the_distance_that_their_pixels_say(measured: Page, maps
     expect(measured.locator("[data-value=distance]")).to_have_count(0)
 
 
+def test_what_is_close_is_told_to_hundredths_of_a_millimetre(page: Page, served: Server, d200: dict[str, Any]) -> None:
+    blur = {name: d200[name] for name in ("image_width_px", "image_height_px")} | {"k_cam_px": 8, "gamma_px": 0.5}
+    served.add({"name": "macro", "focus_distance_m": 0.06, **blur})
+    page.goto("")
+    choose(page, "macro")
+    give(page)
+    picture = stage(page)
+    reply = served.ask("POST", "/depth?camera=macro&format=npz", PHOTOGRAPH.read_bytes())
+    known = np.load(io.BytesIO(reply.body))
+    depth_m, sigma_m = (float(known[name][216, 322]) for name in ("depth_m", "sigma_m"))
+    assert 0.03 < depth_m < 0.09
+    picture.click(position=place_of(picture, 322, 216))
+    told = f"{depth_m:.5f} m ± {sigma_m:.5f} m along the axis"
+    expect(page.get_by_role("region", name="Under the pointer")).to_contain_text(told)
+    expect(page.locator("[data-label=reading]")).to_have_text(told)
+    near = page.get_by_label("Near end of the colours, metres")
+    near.fill("0.0525")
+    near.press("Enter")
+    expect(near).to_have_value("0.05250")
+    expect(page.get_by_role("figure", name=re.compile(r"^Colours: 0\.05250 m near to 0\.\d{5} m far$"))).to_be_visible()
+    page.get_by_label("From the lens to 322, 216 in m").fill("0.061234")
+    with page.expect_request(re.compile("known=322%2C216%2C0.061234&")):
+        page.get_by_role("button", name="Use it").click()
+    expect(page.get_by_role("button", name="Forget 0.06123 m at 322, 216")).to_be_visible()
+    stage(page)
+
+
 def test_the_distance_leaves_the_lens_distortion_out(page: Page, served: Server, d200: dict[str, Any]) -> None:
     matrix = np.array([[950.0, 0, 322], [0, 950, 215.5], [0, 0, 1]])
     distortion = [-0.25, 0.1, 2e-3, -1e-3, 0.02]
