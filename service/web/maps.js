@@ -17,7 +17,7 @@ import { readNpz } from "./npy.js";
  * @property {number} pNear
  * @property {number} blurPx
  * @property {number | null} rayLength metres straight from the lens per metre of depth along its axis; null where the
- *   camera's focal length is not known
+ *   camera's focal length is not known, or no ray meets the pixel
  */
 
 /**
@@ -48,7 +48,11 @@ const APART = 1.25;
 const NOTHING = 0x80;
 const HATCH = 0xb4;
 const PATTERN_PX = 8;
-const UNDISTORT_ROUNDS = 5;
+// as the service's point clouds have it
+const UNDISTORT_ROUNDS = 200;
+const EXACT_PX = 1e-6;
+const LEAST_STEP = 1e-3;
+const MOST_OFF_PX = 0.5;
 
 export class DepthMaps {
 	/** @param {Map<string, import("./npy.js").NumpyArray>} arrays */
@@ -123,7 +127,7 @@ export class DepthMaps {
 			sigmaM: known(this.sigmaM[pixel]),
 			pNear: this.pNear[pixel],
 			blurPx: this.blurPx[pixel],
-			rayLength: known(Math.hypot(...this.ray(u, v))),
+			rayLength: known(Math.hypot(...(this.ray(u, v) ?? [NaN]))),
 		};
 	}
 
@@ -133,11 +137,12 @@ export class DepthMaps {
 	 * @param {{u: number, v: number}} from
 	 * @param {{u: number, v: number}} to
 	 * @returns {{distanceM: number, sigmaM: number} | null} null without a focal length, or where one has no answer
+	 *   or is met by no ray
 	 */
 	distance(from, to) {
 		const ends = [from, to].map(({ u, v }) => {
 			const pixel = v * this.width + u;
-			const [ray, depth] = [this.ray(u, v), this.depthM[pixel]];
+			const [ray, depth] = [this.ray(u, v) ?? [NaN, NaN, NaN], this.depthM[pixel]];
 			return { ray, sigma: this.sigmaM[pixel], point: ray.map((part) => part * depth) };
 		});
 		const apart = ends[0].point.map((part, axis) => part - ends[1].point[axis]);
@@ -147,10 +152,30 @@ export class DepthMaps {
 		return { distanceM, sigmaM: distanceM > 0 ? Math.hypot(...shares) : 0 };
 	}
 
-	/** @param {number} u @param {number} v @returns {number[]} where the pixel looks, 1 m along the optical axis */
+	/**
+	 * Where the pixel looks, 1 m along the optical axis, by the fixed point that OpenCV iterates to.
+	 *
+	 * @param {number} u
+	 * @param {number} v
+	 * @returns {number[] | null} null where no ray meets the pixel: towards the corners of a wide picture a lens'
+	 *   polynomial may turn back, and nothing is distorted to what lies beyond
+	 */
 	ray(u, v) {
 		const { fx, fy, cx, cy } = this.lens;
-		return [...undistorted((u - cx) / fx, (v - cy) / fy, this.distortion), 1];
+		const [x, y] = [(u - cx) / fx, (v - cy) / fy];
+		if (this.distortion.every((term) => term === 0)) return [x, y, 1];
+		const placed = (/** @type {number} */ a, /** @type {number} */ b) => {
+			const { stretch, across, down } = bending(a, b, this.distortion);
+			const offPx = Math.hypot(fx * (a * stretch + across - x), fy * (b * stretch + down - y));
+			return { a, b, offPx, next: [(x - across) / stretch, (y - down) / stretch] };
+		};
+		let [at, step] = [placed(x, y), 1];
+		for (let round = 0; round < UNDISTORT_ROUNDS && step > LEAST_STEP && at.offPx > EXACT_PX; round++) {
+			const to = placed(at.a + step * (at.next[0] - at.a), at.b + step * (at.next[1] - at.b));
+			if (to.offPx < at.offPx) at = to;
+			else step /= 2;
+		}
+		return at.offPx <= MOST_OFF_PX ? [at.a, at.b, 1] : null;
 	}
 
 	/**
@@ -219,6 +244,7 @@ export class DepthMaps {
 				const depth = this.depthM[v * this.width + u];
 				if (!(depth > 0)) continue;
 				const ray = this.ray(u, v);
+				if (ray === null) continue;
 				for (let axis = 0; axis < 3; axis++) positions[3 * count + axis] = ray[axis] * depth;
 				if (photograph) {
 					const x = Math.floor(((u + 0.5) * photograph.width) / this.width);
@@ -244,25 +270,20 @@ export class DepthMaps {
 }
 
 /**
- * Where a pixel would look without the lens' distortion, by the fixed point that OpenCV iterates to.
+ * How a lens bends a ray: by what its place is multiplied, and what is added to that.
  *
  * @param {number} x
- * @param {number} y at a depth of 1, as if there were none
+ * @param {number} y at a depth of 1
  * @param {number[]} distortion in OpenCV's order
- * @returns {[number, number]}
  */
-function undistorted(x, y, distortion) {
-	if (distortion.every((term) => term === 0)) return [x, y];
+function bending(x, y, distortion) {
 	const [k1 = 0, k2 = 0, p1 = 0, p2 = 0, k3 = 0, k4 = 0, k5 = 0, k6 = 0, s1 = 0, s2 = 0, s3 = 0, s4 = 0] = distortion;
-	let [a, b] = [x, y];
-	for (let round = 0; round < UNDISTORT_ROUNDS; round++) {
-		const r2 = a * a + b * b;
-		const shrunk = (1 + r2 * (k4 + r2 * (k5 + r2 * k6))) / (1 + r2 * (k1 + r2 * (k2 + r2 * k3)));
-		const across = 2 * p1 * a * b + p2 * (r2 + 2 * a * a) + r2 * (s1 + r2 * s2);
-		const down = p1 * (r2 + 2 * b * b) + 2 * p2 * a * b + r2 * (s3 + r2 * s4);
-		[a, b] = [(x - across) * shrunk, (y - down) * shrunk];
-	}
-	return [a, b];
+	const r2 = x * x + y * y;
+	return {
+		stretch: (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6))),
+		across: 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + r2 * (s1 + r2 * s2),
+		down: p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + r2 * (s3 + r2 * s4),
+	};
 }
 
 /** @param {number[]} one @param {number[]} other */

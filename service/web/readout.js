@@ -59,7 +59,7 @@ export function Distance({ marks, measured, hasPoints, onClear }) {
 		if (!hasPoints) return "Needs the camera's focal length: give the camera its lens or its intrinsics.";
 		if (marks.length === 0) return "Click two points of the picture.";
 		if (marks.length === 1) return "Click the second point.";
-		return measured === "unknown" ? "One of the points has no answer." : "";
+		return measured === "unknown" ? "One of the points has no answer, or no ray meets it by the camera's distortion." : "";
 	};
 	return html`<section class="card stack" aria-label="Distance in space">
 		<h3 tabindex="-1" ref=${title}>Distance in space</h3>

@@ -34,7 +34,12 @@ export function Tape({ reader, mark, hasPoints, known, onKnown }) {
 		event.preventDefault();
 		if (mark === null) return;
 		const isStraight = hasPoints && way === "straight";
-		const depthM = decimal(text) / (isStraight ? ((await reader.ask("at", mark)).rayLength ?? NaN) : 1);
+		const rayLength = isStraight ? (await reader.ask("at", mark)).rayLength : 1;
+		if (rayLength === null) {
+			setFault("By the camera's distortion no ray meets this pixel.");
+			return;
+		}
+		const depthM = decimal(text) / rayLength;
 		if (!(depthM >= NEAREST_M && depthM <= FARTHEST_M)) {
 			setFault("This is no distance in metres.");
 			return;

@@ -161,6 +161,16 @@ def test_what_no_ray_is_distorted_to_is_no_point(answer: DepthMap) -> None:
     )
 
 
+def test_all_that_a_wide_lens_sees_is_a_point(answer: DepthMap) -> None:
+    # its polynomial never turns back, and the middle of the picture is far from its corners
+    wide = replace(
+        answer, camera=replace(CAMERA, intrinsics=Intrinsics(20.0, 20.0, 19.5, 14.5, (-0.29, 0.08, 0, 0, 0)))
+    )
+    told = encode_ply(wide, RGB)
+    assert told.warnings == ()
+    assert f"element vertex {np.count_nonzero(answer.valid)}\n".encode() in told.body
+
+
 def test_preview_is_near_red_far_blue_and_grey_without_an_answer(answer: DepthMap) -> None:
     answer.depth_m[:8, :8] = np.nan
     pixels = cv2.imdecode(np.frombuffer(encode_preview(answer, RGB).body, np.uint8), cv2.IMREAD_COLOR_RGB)

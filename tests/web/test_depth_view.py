@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from playwright.sync_api import Browser, Locator, Page, Position, Route, expect
 
 from model_export.served import Server, serving
+from service.inference.encode import UNDISTORTING
 from tests.inference import photographs
 from tests.web.chromium import program
 from tests.web.steps import OVERFLOW, eventually
@@ -282,6 +283,32 @@ def test_the_distance_leaves_the_lens_distortion_out(page: Page, served: Server,
     points = [np.array([*ray, 1]) * known["depth_m"][v, u] for ray, (u, v) in zip(seen, ends, strict=True)]
     expect(page.locator("[data-value=distance]")).to_be_visible()
     assert number_in(page, "distance") == pytest.approx(np.linalg.norm(points[0] - points[1]), abs=0.001)
+
+
+def test_no_ray_is_made_up_where_the_lens_has_none(opened: Page) -> None:
+    """Its polynomial turns back towards the corners; near there, it takes many rounds to undo."""
+    matrix = np.array([[320.0, 0, 320], [0, 320, 240], [0, 0, 1]])
+    distortion = [-0.28, 0.07, 1e-3, -5e-4, -8e-3]
+    places = [[u, v] for v in range(0, 480, 16) for u in range(0, 640, 16)]
+    about = {"K": matrix.ravel().tolist(), "distortion": distortion, "places": places}
+    rays = opened.evaluate(
+        """async ({K, distortion, places}) => {
+          const { DepthMaps } = await import("./web/maps.js");
+          const none = { data: new Float32Array(640 * 480), shape: [480, 640] };
+          const named = ["depth_m", "depth_alt_m", "p_near", "sigma_m", "blur_px"].map((name) => [name, none]);
+          const maps = new DepthMaps(new Map([...named, ["K", { data: K }], ["distortion", { data: distortion }]]));
+          return places.map(([u, v]) => maps.ray(u, v));
+        }""",
+        about,
+    )
+    is_met = np.array([ray is not None for ray in rays])
+    place, bend = np.array(places, np.float64), np.array(distortion)
+    seen = cv2.undistortPoints(place[:, None], matrix, bend, criteria=UNDISTORTING)
+    back = cv2.projectPoints(cv2.convertPointsToHomogeneous(seen), np.zeros(3), np.zeros(3), matrix, bend)[0]
+    np.testing.assert_array_equal(is_met, np.hypot(*(back[:, 0] - place).T) <= 0.5)
+    assert 0.85 < is_met.mean() < 0.95
+    ours = np.array([ray for ray in rays if ray is not None])[:, :2]
+    assert np.abs(ours - seen[is_met, 0]).max() < 0.005
 
 
 def test_keys_alone_read_and_measure(measured: Page, maps: Callable[..., Any]) -> None:
