@@ -153,15 +153,13 @@ export async function request(path, options = {}) {
 }
 
 /**
- * An answer with its body, which may break off too.
+ * The body of an answer, which may break off too.
  *
+ * @param {Response} answer
  * @param {"json" | "blob" | "text"} kind
- * @param {string} path
- * @param {RequestOptions} [options]
  * @returns {Promise<any>}
  */
-async function read(kind, path, options) {
-	const answer = await request(path, options);
+export async function readBody(answer, kind) {
 	try {
 		return await answer[kind]();
 	} catch (error) {
@@ -170,13 +168,22 @@ async function read(kind, path, options) {
 }
 
 /** @param {string} path @param {RequestOptions} [options] @returns {Promise<any>} */
-export const getJson = (path, options) => read("json", path, options);
+export const getJson = async (path, options) => readBody(await request(path, options), "json");
 
 /** @param {string} path @param {RequestOptions} [options] @returns {Promise<Blob>} */
-export const getBlob = (path, options) => read("blob", path, options);
+export const getBlob = async (path, options) => readBody(await request(path, options), "blob");
 
 /** @param {string} path @param {RequestOptions} [options] @returns {Promise<string>} */
-export const getText = (path, options) => read("text", path, options);
+export const getText = async (path, options) => readBody(await request(path, options), "text");
+
+/** What the headers of an answer tell of it. @param {Headers} headers */
+export function readDepthHeaders(headers) {
+	return {
+		focusM: Number(headers.get("Camind-Focus-Distance-M")),
+		revision: Number(headers.get("Camind-Camera-Revision")),
+		warnings: (headers.get("Camind-Warnings") ?? "").split("; ").filter(Boolean),
+	};
+}
 
 /** @param {string} path @param {unknown} body @param {RequestOptions} [options] @returns {Promise<any>} */
 export function sendJson(path, body, { method = "POST", headers = {}, ...options } = {}) {

@@ -1,6 +1,6 @@
 /** The depth view: a camera, a photograph, and the metres in it. */
 
-import { Problem, upload } from "./api.js";
+import { Problem, readDepthHeaders, upload } from "./api.js";
 import { usableM } from "./camera_specs.js";
 import { CloudView } from "./cloud_view.js";
 import { depthPath } from "./commands.js";
@@ -31,6 +31,7 @@ import { html, useCallback, useEffect, useMemo, useRef, useState } from "./vendo
  * @property {Facts} facts
  * @property {Blob} npz
  * @property {number} focusM the focus distance that was used
+ * @property {number} revision of the camera
  * @property {string[]} warnings
  * @property {[string, number][]} timings the service's stages in milliseconds
  * @property {string} model
@@ -172,23 +173,22 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 			const facts = await reader.ask("load", { npz: answer.body });
 			if (signal.aborted) return;
 			const { spread } = facts;
+			const told = readDepthHeaders(answer.headers);
 			if (spread) setLook((before) => ({ ...before, nearM: spread.nearM, farM: spread.farM }));
 			setResult({
 				asked: ask,
 				file: sent,
 				facts,
 				npz: answer.body,
-				focusM: Number(answer.headers.get("Camind-Focus-Distance-M")),
-				warnings: (answer.headers.get("Camind-Warnings") ?? "").split("; ").filter(Boolean),
+				...told,
 				timings: readTimings(answer.headers.get("Server-Timing") ?? ""),
 				model: answer.headers.get("Camind-Model") ?? "",
 			});
 			setReading(null);
 			setMarks((before) => [...before]);
 			setPhase(null);
-			const revision = Number(answer.headers.get("Camind-Camera-Revision"));
-			if (revision !== camera?.revision) {
-				ahead.current = `${name} ${revision}`;
+			if (told.revision !== camera?.revision) {
+				ahead.current = `${name} ${told.revision}`;
 				reloadCameras();
 			}
 			announce(
@@ -343,7 +343,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 							/>
 							${result &&
 							html`<${Colours} look=${look} facts=${result.facts} onLook=${setLook} />
-								<${Exports} key=${result.model + JSON.stringify(result.asked)} result=${result} announce=${announce} />
+								<${Exports} key=${result.model + JSON.stringify(result.asked)} ...${{ result, announce }} onChanged=${reloadCameras} />
 								<${Timings} timings=${result.timings} model=${result.model} />`}
 						</div>`}
 					</div>`}

@@ -1,18 +1,22 @@
 /** The answer as a file in every format, and the request for it as something to paste. */
 
-import { getBlob, problemOf, storedKey } from "./api.js";
+import { problemOf, readBody, readDepthHeaders, request, storedKey } from "./api.js";
 import { FORMATS, answerName, curlCommand, depthPath, pythonCommand } from "./commands.js";
 import { mediaTypeOf } from "./photograph_files.js";
-import { ProblemBox, useProblem } from "./problem_box.js";
+import { ProblemBox, Warnings, useProblem } from "./problem_box.js";
 import { save } from "./save.js";
 import { Choice } from "./text_field.js";
 import { html, useState } from "./vendor/preact.js";
 
-/** @param {{result: import("./depth.js").Result, announce: (text: string) => void}} props */
-export function Exports({ result: { asked, file, npz }, announce }) {
+/**
+ * @param {{result: import("./depth.js").Result, announce: (text: string) => void, onChanged: () => void}} props
+ *   `onChanged` is told that the camera is no longer the one that the result was read by
+ */
+export function Exports({ result: { asked, file, npz, revision, warnings }, announce, onChanged }) {
 	const [format, setFormat] = useState("png");
 	const [isBusy, setIsBusy] = useState(false);
 	const [problem, setProblem] = useProblem();
+	const [told, setTold] = useState(/** @type {string[]} */ ([]));
 	const [copied, setCopied] = useState(/** @type {{text: string, isCopied: boolean} | null} */ (null));
 	const path = depthPath({ ...asked, format });
 	const mediaType = mediaTypeOf(file);
@@ -21,16 +25,30 @@ export function Exports({ result: { asked, file, npz }, announce }) {
 	async function download() {
 		setIsBusy(true);
 		setProblem(null);
+		setTold([]);
 		try {
-			// the service keeps no photograph: it is sent again
-			const asked = { method: "POST", body: file, headers: { "Content-Type": mediaType } };
-			save(format === "npz" ? npz : await getBlob(path, asked), answer);
-			announce(`${answer} is downloaded.`);
+			const got = format === "npz" ? { body: npz, told: [] } : await ask();
+			setTold(got.told);
+			if (got.body) save(got.body, answer);
+			announce([...(got.body ? [`${answer} is downloaded`] : []), ...got.told].map((text) => `${text}.`).join(" "));
 		} catch (error) {
 			setProblem(problemOf(error));
 		} finally {
 			setIsBusy(false);
 		}
+	}
+
+	/** The service keeps no photograph: it is sent again. @returns {Promise<{body: Blob | null, told: string[]}>} no body where it is another camera's now */
+	async function ask() {
+		const reply = await request(path, { method: "POST", body: file, headers: { "Content-Type": mediaType } });
+		const now = readDepthHeaders(reply.headers);
+		if (now.revision !== revision) {
+			reply.body?.cancel();
+			onChanged();
+			const words = `camera ${asked.camera} was changed to revision ${now.revision}: nothing is downloaded`;
+			return { body: null, told: [`${words}, the photograph is read again`] };
+		}
+		return { body: await readBody(reply, "blob"), told: now.warnings.filter((text) => !warnings.includes(text)) };
 	}
 
 	/** @param {typeof curlCommand} write */
@@ -64,6 +82,7 @@ export function Exports({ result: { asked, file, npz }, announce }) {
 			<button type="button" onClick=${() => copy(pythonCommand)}>Copy as Python</button>
 		</div>
 		<${ProblemBox} problem=${problem} onClose=${() => setProblem(null)} />
+		<${Warnings} texts=${told} />
 		${copied &&
 		html`<p class="hint">
 				${copied.isCopied ? "Copied." : "Copy it from here."} To be run in the photograph's

@@ -650,6 +650,35 @@ def test_every_format_can_be_taken_along(measured: Page, served: Server) -> None
         assert downloading.value.path().read_bytes() == reply.body
 
 
+def test_a_download_is_of_the_same_camera_and_says_what_it_lacks(
+    opened: Page, served: Server, d200: dict[str, Any]
+) -> None:
+    size = {name: d200[name] for name in ("image_width_px", "image_height_px")}
+    afar = {"name": "afar", "focus_distance_m": 70, "k_cam_px": 8, **size}
+    served.add(afar)
+    opened.reload()
+    choose(opened, "afar")
+    give(opened)
+    stage(opened)
+    exports = opened.get_by_role("region", name="Take it along")
+    with opened.expect_download():
+        exports.get_by_role("button", name="Download").click()
+    expect(exports).to_contain_text("of the pixels lie beyond the 65.535 m a 16-bit PNG can hold and read 0")
+    changed = afar | {"focus_distance_m": 50}
+    served.ask("PUT", "/cameras/afar", json.dumps(changed), {"Content-Type": "application/json"})
+    downloads: list[str] = []
+    opened.on("download", lambda download: downloads.append(download.suggested_filename))
+    with opened.expect_response(lambda answer: "format=npz" in answer.url):
+        exports.get_by_role("button", name="Download").click()
+    expect(exports).to_contain_text("Camera afar was changed to revision 2: nothing is downloaded")
+    stage(opened)
+    expect(opened.get_by_text("focused at 50 m")).to_be_visible()
+    assert downloads == []
+    with opened.expect_download():
+        exports.get_by_role("button", name="Download").click()
+    served.ask("DELETE", "/cameras/afar")
+
+
 def test_a_photograph_that_is_no_frame_of_the_camera_drafts_its_own(
     opened: Page, served: Server, expected_errors: list[str]
 ) -> None:
