@@ -233,6 +233,8 @@ def test_two_points_have_the_distance_that_their_pixels_say(measured: Page, maps
     ]
     assert number_in(measured, "distance-sigma") == pytest.approx(np.hypot(*shares), abs=0.001)
     expect(measured.locator("[data-label=distance]")).to_be_visible()
+    apart, error = (measured.locator(f"[data-value={name}]").inner_text() for name in ("distance", "distance-sigma"))
+    expect(measured.get_by_role("status")).to_have_text(f"The points are {apart} {error} apart.")
     picture.press("Escape")
     expect(measured.locator("[data-value=distance]")).to_have_count(0)
 

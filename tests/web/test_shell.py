@@ -25,6 +25,7 @@ ROOT = Path(__file__).parents[2]
 TABS = ("depth", "cameras", "calibrate", "status")
 QUOTA = 40
 REFUSED = "status of 401"
+LINE_COLOUR = "(element) => getComputedStyle(element).borderBottomColor"
 
 
 @dataclass(frozen=True)
@@ -100,6 +101,14 @@ def test_tabs_work_from_the_keyboard_and_show_where_it_is(page: Page) -> None:
     # one stop for all tabs, then on into the view
     page.keyboard.press("Tab")
     expect(page.get_by_role("tab", name="Depth")).not_to_be_focused()
+
+
+def test_the_chosen_tab_differs_in_the_readers_own_colours(page: Page) -> None:
+    page.emulate_media(forced_colors="active")
+    page.goto("#status")
+    tabs = page.get_by_role("tab").all()
+    colours = {tab.get_attribute("aria-selected"): tab.evaluate(LINE_COLOUR) for tab in tabs}
+    assert colours["true"] != colours["false"]
 
 
 @pytest.mark.parametrize("tab", TABS)
