@@ -92,11 +92,10 @@ def _coarse(levels: NDArray[np.uint16]) -> tuple[str, ...]:
     """A warning where millimetres are few for what is close, by some of the pixels: all of them would take long."""
     step = math.ceil(math.sqrt(levels.size / SAMPLES))
     some = levels[::step, ::step]
-    known = some[some > 0]
-    if known.size == 0:
+    if np.count_nonzero(some > CLOSE_MILLIMETRES) >= 0.05 * np.count_nonzero(some):
         return ()
-    low, high = np.percentile(known, (5, 95))
-    if high > CLOSE_MILLIMETRES or high - low >= FEW_MILLIMETRES:
+    low, high = np.percentile(some[some > 0], (5, 95))
+    if high - low >= FEW_MILLIMETRES:
         return ()
     return (
         f"nine tenths of the depths lie within {high - low:.0f} mm, and a 16-bit PNG holds whole millimetres: npy, npz "
