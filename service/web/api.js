@@ -176,7 +176,7 @@ export const getBlob = async (path, options) => readBody(await request(path, opt
 /** @param {string} path @param {RequestOptions} [options] @returns {Promise<string>} */
 export const getText = async (path, options) => readBody(await request(path, options), "text");
 
-/** What the headers of an answer tell of it. @param {Headers} headers */
+/** @param {Headers} headers of an answer of `POST /depth` */
 export function readDepthHeaders(headers) {
 	return {
 		focusM: Number(headers.get("Camind-Focus-Distance-M")),

@@ -109,12 +109,10 @@ export function missingOf(fields) {
 }
 
 /**
- * k_cam at the focus distance that is filled in, where it stands as it holds at another one: the focal length, which is
- * not known, is taken to be far below either.
+ * k_cam at the focus distance that is filled in, of a focal length far below it; null where there is nothing to change.
  *
  * @param {Fields} fields
- * @param {{k_cam_px: number, focus_distance_m: number} | null} held
- * @returns {{focusM: number, kCamPx: number} | null} null where there is nothing to change
+ * @param {{k_cam_px: number, focus_distance_m: number} | null} held as it is known
  */
 export function refocusedKCam(fields, held) {
 	const focusM = toMetres(fields.focus_distance_m ?? "");

@@ -104,8 +104,10 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 		setReading(null);
 		setMarks([]);
 		setKnown([]);
-		setSide("auto");
-		forgetFocus();
+		if (newest.current !== null) {
+			setSide("auto");
+			forgetFocus();
+		}
 		setPhotograph(null);
 		setIsOpening(true);
 		setIsDrafting(false);

@@ -8,10 +8,7 @@ import { save } from "./save.js";
 import { Choice } from "./text_field.js";
 import { html, useState } from "./vendor/preact.js";
 
-/**
- * @param {{result: import("./depth.js").Result, announce: (text: string) => void, onChanged: () => void}} props
- *   `onChanged` is told that the camera is no longer the one that the result was read by
- */
+/** @param {{result: import("./depth.js").Result, announce: (text: string) => void, onChanged: () => void}} props */
 export function Exports({ result: { asked, file, npz, revision, warnings }, announce, onChanged }) {
 	const [format, setFormat] = useState("png");
 	const [isBusy, setIsBusy] = useState(false);
@@ -30,7 +27,7 @@ export function Exports({ result: { asked, file, npz, revision, warnings }, anno
 			const got = format === "npz" ? { body: npz, told: [] } : await ask();
 			setTold(got.told);
 			if (got.body) save(got.body, answer);
-			announce([...(got.body ? [`${answer} is downloaded`] : []), ...got.told].map((text) => `${text}.`).join(" "));
+			announce([...(got.body ? [`${answer} is downloaded`] : []), ...got.told].join(". "));
 		} catch (error) {
 			setProblem(problemOf(error));
 		} finally {

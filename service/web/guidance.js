@@ -9,7 +9,7 @@ import { upright } from "./photograph_files.js";
  * @property {number} width before EXIF orientation
  * @property {number} height
  * @property {number} orientation of EXIF
- * @property {{u_px: number, v_px: number}[]} circles
+ * @property {{u_px: number, v_px: number, radius_px: number}[]} circles
  * @property {number | null} blur in px
  * @property {number | null} distance in metres
  * @property {number | null} tilt in degrees
@@ -24,6 +24,7 @@ const WANTED_A_SIDE = 2;
 const SIDE = 1.12; // times the focus distance: nearer than 1/1.12 and farther than 1.12 count as a side
 const BLURRED_PX = 1.5;
 const BLUR_RATIO = 2;
+const MOST_BLUR = 1 / 3; // of a circle's radius: in more the grid is hard to find
 /** @typedef {[number, number]} Between */
 /** @type {Between} */
 const NEARER = [0.6, 0.8];
@@ -92,12 +93,42 @@ function missingSide(seen, focus) {
 		if (sizes.length > 0 && sizes[sizes.length - 1] > sizes[0] * SIDE ** 2) return null;
 		return sizes.length % 2 === 0 ? "nearer than the plane in focus" : "farther than the plane in focus";
 	}
-	const at = (/** @type {Between} */ [low, high]) => `at ${short(focus * low, 2)}–${short(focus * high, 2)} m`;
-	const nearer = distances.filter((distance) => distance < focus / SIDE).length;
-	const farther = distances.filter((distance) => distance > focus * SIDE).length;
-	if (nearer < WANTED_A_SIDE && nearer <= farther) return at(NEARER);
-	if (farther < WANTED_A_SIDE) return at(FARTHER);
-	return nearer < WANTED_A_SIDE ? at(NEARER) : null;
+	const clear = clearlyBlurred(defocused);
+	const count = (/** @type {(distance: number, edge: number) => boolean} */ isBeyond) =>
+		defocused.filter(
+			(one) => one.distance !== null && (isBeyond(one.distance, SIDE) || (clear.includes(one) && isBeyond(one.distance, 1))),
+		).length;
+	const nearer = count((distance, edge) => distance < focus / edge);
+	const farther = count((distance, edge) => distance > focus * edge);
+	if (nearer >= WANTED_A_SIDE && farther >= WANTED_A_SIDE) return null;
+	const isNearer = nearer < WANTED_A_SIDE && nearer <= farther;
+	const [low, high] = within(isNearer ? NEARER : FARTHER, reachOf(clear, focus));
+	const digits = high < low * SIDE ? 3 : 2;
+	return `at ${short(focus * low, digits)}–${short(focus * high, digits)} m`;
+}
+
+/** @param {Seen[]} defocused @returns those whose blur tells a side, however near the plane in focus is */
+function clearlyBlurred(defocused) {
+	const least = Math.min(...defocused.flatMap(({ blur }) => blur ?? []));
+	return defocused.filter(({ blur }) => blur !== null && blur >= BLUR_RATIO * least);
+}
+
+/** Where blur is `MOST_BLUR`, in focus distances from the plane in focus: it grows with |s1/z - 1|, a radius with 1/z. @param {Seen[]} clear @param {number} focus */
+function reachOf(clear, focus) {
+	const reaches = clear.flatMap(({ circles, blur, distance }) => {
+		if (!blur || distance === null || distance === focus) return [];
+		const radius = circles.reduce((sum, { radius_px }) => sum + radius_px, 0) / circles.length;
+		return [(MOST_BLUR * radius * Math.abs(distance / focus - 1)) / blur];
+	});
+	reaches.sort((a, b) => a - b);
+	return reaches[reaches.length >> 1] ?? Infinity;
+}
+
+/** @param {Between} between @param {number} reach from the plane in focus, beyond which none is sent @returns {Between} */
+function within([low, high], reach) {
+	return high < 1
+		? [Math.max(low, 1 - reach), Math.max(high, 1 - reach / 2)]
+		: [Math.min(low, 1 + reach / 2), Math.min(high, 1 + reach)];
 }
 
 /** @param {Seen[]} seen @returns {string | null} what to take where all are blurred alike, which tells k_cam no more than one */

@@ -152,14 +152,7 @@ export class DepthMaps {
 		return { distanceM, sigmaM: distanceM > 0 ? Math.hypot(...shares) : 0 };
 	}
 
-	/**
-	 * Where the pixel looks, 1 m along the optical axis, by the fixed point that OpenCV iterates to.
-	 *
-	 * @param {number} u
-	 * @param {number} v
-	 * @returns {number[] | null} null where no ray meets the pixel: towards the corners of a wide picture a lens'
-	 *   polynomial may turn back, and nothing is distorted to what lies beyond
-	 */
+	/** @param {number} u @param {number} v @returns {number[] | null} where the pixel looks, 1 m along the optical axis; null where no ray meets it */
 	ray(u, v) {
 		const { fx, fy, cx, cy } = this.lens;
 		const [x, y] = [(u - cx) / fx, (v - cy) / fy];
@@ -269,13 +262,7 @@ export class DepthMaps {
 	}
 }
 
-/**
- * How a lens bends a ray: by what its place is multiplied, and what is added to that.
- *
- * @param {number} x
- * @param {number} y at a depth of 1
- * @param {number[]} distortion in OpenCV's order
- */
+/** How a lens bends a ray. @param {number} x @param {number} y at a depth of 1 @param {number[]} distortion in OpenCV's order */
 function bending(x, y, distortion) {
 	const [k1 = 0, k2 = 0, p1 = 0, p2 = 0, k3 = 0, k4 = 0, k5 = 0, k6 = 0, s1 = 0, s2 = 0, s3 = 0, s4 = 0] = distortion;
 	const r2 = x * x + y * y;

@@ -95,8 +95,7 @@ export function Timings({ timings, model }) {
 }
 
 /**
- * The side that the answer is on, and how likely that is; both sides, where neither is chosen: where the depth is drawn
- * beyond its own side, or that side is the less likely one.
+ * The side that the answer is on; both, where it is drawn over to the other's or is on the less likely one.
  *
  * @param {number} depthM
  * @param {Reading} reading

@@ -1,5 +1,6 @@
 """The calibration in a real browser, on simulated photographs of the sheet: from the print to the camera."""
 
+import math
 import re
 import signal
 from collections.abc import Callable, Iterator
@@ -186,6 +187,35 @@ def test_a_set_is_good_where_blur_differs(page: Page, blurs: list[float], advice
     page.goto("#calibrate")
     told = page.evaluate("async (seen) => (await import('/web/guidance.js')).adviceFor(seen, null)", seen)
     assert told.startswith(advice)
+
+
+@pytest.mark.parametrize(
+    ("distances", "advice"),
+    [
+        # a third of a circle's radius of blur is 0.012 m away
+        ((0.2, 0.195), "Next: one at 0.206 to 0.212 m."),
+        ((0.2, 0.195, 0.196, 0.21), "Next: one at 0.206 to 0.212 m."),
+        ((0.2, 0.21, 0.205), "Next: one at 0.188 to 0.194 m."),
+        ((0.2, 0.195, 0.205, 0.196, 0.21), "Next: one with the sheet towards the lower left corner."),
+    ],
+)
+def test_a_lens_that_blurs_much_is_not_sent_far_away(page: Page, distances: tuple[float, ...], advice: str) -> None:
+    seen = [
+        {
+            "role": "defocused",
+            "width": 600,
+            "height": 400,
+            "orientation": 1,
+            "circles": [{"u_px": u, "v_px": v, "radius_px": 36 * 0.2 / z} for u, v in ((5, 5), (595, 5), (595, 395))],
+            "blur": math.hypot(0.5, 200 * (0.2 / z - 1)),
+            "distance": z,
+            "tilt": 15,
+        }
+        for z in distances
+    ]
+    page.goto("#calibrate")
+    told = page.evaluate("async (seen) => (await import('/web/guidance.js')).adviceFor(seen, null)", seen)
+    assert told.replace(", tilted by 15 to 25 degrees", "").replace("\u2013", " to ") == advice
 
 
 def test_a_result_that_is_not_determined_is_no_success(page: Page, photographs: list[Path], name: str) -> None:

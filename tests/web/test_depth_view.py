@@ -429,6 +429,14 @@ def test_another_side_or_focus_is_read_again_and_so_is_what_was_measured(
     expect(focus).to_have_value("")
 
 
+def test_the_side_may_be_told_before_the_photograph(opened: Page) -> None:
+    choose(opened)
+    opened.get_by_role("combobox", name="Side of the plane in focus").select_option("far")
+    with opened.expect_request(re.compile(r"/depth\?camera=d200&side=far&format=npz$")):
+        give(opened)
+    stage(opened)
+
+
 def test_what_a_tape_says_moves_the_focus_and_can_be_forgotten(
     measured: Page, maps: Callable[..., Any], barriers: Callable[[Page], list[str]]
 ) -> None:
