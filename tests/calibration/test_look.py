@@ -48,7 +48,7 @@ def test_a_sheet_whose_circles_are_not_as_told_beside_their_spacing_is_noticed(
 def test_a_file_of_linear_light_is_said_to_be_one_perhaps() -> None:
     rng = np.random.default_rng(3)
     taken = photograph(rng, CAMERA, draw_pose(rng, CAMERA, SHEETS[0], 0.38), SHEETS[0], focused=False)
-    linear = np.rint(230 * decode_srgb(taken.astype(np.float32) / 255)).astype(np.uint8)
+    linear = np.rint(230 * decode_srgb(np.asarray(taken / 255, np.float32))).astype(np.uint8)
     assert "linear light" in " ".join(look(linear, SHEETS[0], None).warnings)
     assert "linear light" not in " ".join(look(taken, SHEETS[0], None).warnings)
 
