@@ -24,6 +24,7 @@ from service.memory import keep_freed_memory
 from service.middleware import REQUEST_ID, request_id_of
 
 GRACE_S = 1.0
+KEEP_ALIVE_S = 75  # longer than what proxies keep: who closes last is never asked on a connection just closed
 BACKLOG = 2048
 MOST_HEADER_BYTES = 65_536
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
@@ -231,6 +232,7 @@ def serve(app: FastAPI, settings: Settings, listener: socket.socket) -> bool:
         log_config=None,
         access_log=False,
         server_header=False,
+        timeout_keep_alive=KEEP_ALIVE_S,
         timeout_graceful_shutdown=int(settings.deadline_s) + 1,
     )
     server = StoppingServer(config, app, settings.drain_s)

@@ -1,5 +1,6 @@
 """How the process begins and ends: not on a damaged database, and not before what was asked is answered."""
 
+import http.client
 import json
 import os
 import signal
@@ -65,6 +66,21 @@ def test_a_request_in_flight_is_answered_before_the_end(server: Server, number: 
         assert connection.recv(100).startswith(b"HTTP/1.1 201 ")
     assert server.process.wait(timeout=30) == 0
     assert "Traceback" not in server.log
+
+
+def test_a_connection_is_kept_between_requests_and_holds_up_no_end(server: Server) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=10)
+    connection.connect()
+    kept = connection.sock
+    for pause_s in (5.5, 0):
+        connection.request("GET", "/health/live")
+        assert connection.getresponse().read()
+        time.sleep(pause_s)
+    assert connection.sock is kept
+    started_s = time.monotonic()
+    assert server.stop(signal.SIGTERM) == 0
+    assert time.monotonic() - started_s < 4
+    connection.close()
 
 
 def test_a_second_signal_ends_it_at_once(server: Server) -> None:
