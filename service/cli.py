@@ -20,7 +20,7 @@ from service.principal import EVERYDAY, LOCAL, SCOPES
 
 if TYPE_CHECKING:
     from service.calibration.report import Result
-    from service.storage.cameras import CameraRecord
+    from service.storage.cameras import CameraDraft, CameraRecord, Cameras
 
 GROUP = "camind.commands"
 WRONG_USE = 2
@@ -299,7 +299,7 @@ def _seed(engine: Engine, owner: str) -> list[str]:
 def add_camera(
     file: Annotated[typer.FileBinaryRead, typer.Argument(help="JSON as POST /cameras takes it; - for standard input")],
     replace: Annotated[
-        bool, typer.Option("--replace", help="A new revision, where a camera of that name is there")
+        bool, typer.Option("--replace", help="A new revision, where a camera of that name is there and not the same")
     ] = False,
     owner: Owner = LOCAL,
 ) -> None:
@@ -329,8 +329,17 @@ def add_camera(
                     raise _failure(
                         f"A camera '{body.name}' exists already: --replace gives it a new revision."
                     ) from exc
-                record = cameras.replace(draft)
+                record = _replaced(cameras, draft)
     typer.echo(_line_of(record))
+
+
+def _replaced(cameras: "Cameras", draft: "CameraDraft") -> "CameraRecord":
+    """The camera at a new revision, or as it is where that would be the same."""
+    record = cameras.get(draft.name)
+    if record.draft == draft:
+        typer.echo("unchanged:", err=True)
+        return record
+    return cameras.replace(draft)
 
 
 @cameras_app.command(name="show")

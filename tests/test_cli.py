@@ -244,7 +244,11 @@ def test_a_camera_is_shown_as_what_stores_it_and_replaced_and_deleted(known_by: 
     shown = at_once("cameras", "show", "other").stdout
     assert json.loads(shown) == {name: value for name, value in told.items() if value is not None}
     assert "--replace" in at_once("cameras", "add", "-", said=shown).stderr
-    assert "\tr2\t" in at_once("cameras", "add", "--replace", "-", said=shown).stdout
+    same = at_once("cameras", "add", "--replace", "-", said=shown)
+    assert ("\tr1\t" in same.stdout, same.stderr) == (True, "unchanged:\n")
+    moved = shown.replace("on the bench", "on the wall")
+    assert "\tr2\t" in at_once("cameras", "add", "--replace", "-", said=moved).stdout
+    assert "\tr3\t" in at_once("cameras", "add", "--replace", "-", said=shown).stdout
     assert at_once("cameras", "delete", "other").exit_code == 0
     for command in ("show", "delete"):
         gone = at_once("cameras", command, "other")
