@@ -109,3 +109,12 @@ def test_every_reference_leads_somewhere(document: dict[str, Any]) -> None:
     for reference in references(document):
         _, section, kind, name = reference.split("/")
         assert name in document[section][kind], reference
+
+
+def test_what_makes_clients_of_it_misreads_nothing(document: dict[str, Any]) -> None:
+    assert "itemSchema" not in json.dumps(document)  # of OpenAPI 3.2
+    schemas = document["components"]["schemas"]
+    assert "oneOf" not in schemas["CameraCreate"]  # some make a type of each choice, without the other fields
+    errors = schemas["Problem"]["properties"]["errors"]
+    assert "null" not in json.dumps(errors)
+    assert "default" not in errors

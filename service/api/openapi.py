@@ -24,6 +24,8 @@ SECURITY = {
     "scheme": "bearer",
     "description": "An API key from `camind keys create`; not asked for where only the own machine reaches the service",
 }
+# what each event of a calibration holds, as text
+EVENT_DATA = {"contentMediaType": "application/json", "contentSchema": {"$ref": REF.format(model="CalibrationRead")}}
 FRAMEWORK_SCHEMAS = ("HTTPValidationError", "ValidationError")
 REQUEST_ID_REF = {"$ref": "#/components/headers/RequestId"}
 REQUEST_ID = {
@@ -77,9 +79,9 @@ def _complete(operation: dict[str, Any]) -> None:
             operation["responses"].setdefault(str(status), answer)
     for answer in operation["responses"].values():
         for content in answer.get("content", {}).values():
-            # OpenAPI 3.1 knows no items of a stream: the data of each is the whole calibration
-            if content.pop("itemSchema", None) is not None:
-                content["schema"] = {"$ref": REF.format(model="CalibrationRead")}
+            if "itemSchema" in content:  # OpenAPI 3.1 knows no items of a stream
+                content["schema"] = content.pop("itemSchema")
+                content["schema"]["properties"]["data"] |= EVENT_DATA
         answer.setdefault("headers", {})["X-Request-Id"] = REQUEST_ID_REF
 
 
