@@ -1,5 +1,6 @@
 """openapi.yaml is the app's, whole, and says of every route what it answers."""
 
+import json
 import re
 from pathlib import Path
 from typing import Any
