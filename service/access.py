@@ -45,7 +45,9 @@ SCOPES_BY_PATH: dict[str, tuple[KeyScope | None, KeyScope | None]] = {
 CLOCK_STEP_S = 1.0
 CORS_HEADERS = {
     "Access-Control-Allow-Methods": "GET, HEAD, POST, PUT, DELETE",
-    "Access-Control-Allow-Headers": "Authorization, Content-Type, If-Match, Idempotency-Key, Prefer, X-Request-Id",
+    "Access-Control-Allow-Headers": (
+        "Authorization, Content-Type, Idempotency-Key, If-Match, If-None-Match, Prefer, X-Request-Id"
+    ),
     "Access-Control-Expose-Headers": (
         "ETag, Location, Preference-Applied, Retry-After, Server-Timing, WWW-Authenticate, X-Request-Id, "
         "Camind-Camera, Camind-Camera-Revision, Camind-Depth-Scale-M, Camind-Focus-Distance-M, Camind-Model, "

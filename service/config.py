@@ -33,6 +33,10 @@ def _expanded(path: Path) -> Path:
         raise ValueError(f"there is no such home: {exc}") from exc
 
 
+def _listed(text: str) -> frozenset[str]:
+    return frozenset(part.strip().lower() for part in text.split(",") if part)
+
+
 Folder = Annotated[Path, AfterValidator(_expanded)]
 
 
@@ -205,12 +209,12 @@ class Settings(BaseSettings):
     @property
     def known_hosts(self) -> frozenset[str]:
         """``hosts``, one by one."""
-        return frozenset(name.strip().lower() for name in self.hosts.split(",") if name)
+        return _listed(self.hosts)
 
     @property
     def known_origins(self) -> frozenset[str]:
         """``origins``, one by one."""
-        return frozenset(origin.strip().lower() for origin in self.origins.split(",") if origin)
+        return _listed(self.origins)
 
     @property
     def is_loopback(self) -> bool:

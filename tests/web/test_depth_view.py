@@ -239,15 +239,20 @@ def test_two_points_have_the_distance_that_their_pixels_say(measured: Page, maps
     expect(measured.locator("[data-value=distance]")).to_have_count(0)
 
 
+def shown_by(page: Page, served: Server, camera: str) -> tuple[Locator, Any]:
+    """The photograph read by a stored camera on the page, and the maps that the service answers for both."""
+    page.goto("")
+    choose(page, camera)
+    give(page)
+    picture = stage(page)
+    reply = served.ask("POST", f"/depth?camera={camera}&format=npz", PHOTOGRAPH.read_bytes())
+    return picture, np.load(io.BytesIO(reply.body))
+
+
 def test_what_is_close_is_told_to_hundredths_of_a_millimetre(page: Page, served: Server, d200: dict[str, Any]) -> None:
     blur = {name: d200[name] for name in ("image_width_px", "image_height_px")} | {"k_cam_px": 8, "gamma_px": 0.5}
     served.add({"name": "macro", "focus_distance_m": 0.06, **blur})
-    page.goto("")
-    choose(page, "macro")
-    give(page)
-    picture = stage(page)
-    reply = served.ask("POST", "/depth?camera=macro&format=npz", PHOTOGRAPH.read_bytes())
-    known = np.load(io.BytesIO(reply.body))
+    picture, known = shown_by(page, served, "macro")
     depth_m, sigma_m = (float(known[name][216, 322]) for name in ("depth_m", "sigma_m"))
     assert 0.03 < depth_m < 0.09
     picture.click(position=place_of(picture, 322, 216))
@@ -271,12 +276,7 @@ def test_the_distance_leaves_the_lens_distortion_out(page: Page, served: Server,
     distortion = [-0.25, 0.1, 2e-3, -1e-3, 0.02]
     lens = {"fx_px": 950, "fy_px": 950, "cx_px": 322, "cy_px": 215.5, "distortion": distortion}
     served.add({**d200, "name": "barrel", "intrinsics": lens})
-    page.goto("")
-    choose(page, "barrel")
-    give(page)
-    picture = stage(page)
-    reply = served.ask("POST", "/depth?camera=barrel&format=npz", PHOTOGRAPH.read_bytes())
-    known = np.load(io.BytesIO(reply.body))
+    picture, known = shown_by(page, served, "barrel")
     np.testing.assert_array_equal(known["distortion"], distortion)
     ends = ((40, 400), (560, 90))
     for u, v in ends:
