@@ -220,7 +220,7 @@ def at_once(*arguments: str, said: str = "") -> Result:
     ("specs", "code", "said"),
     [
         ("x", 2, "This is no JSON: "),
-        ("[]", 2, "valid dictionary"),
+        ("[]", 2, "JSON object"),
         (json.dumps({**BENCH, "focus_distance_m": -2}), 2, "focus_distance_m: "),
         (json.dumps({**BENCH, "name": "half", "description": "\ud800"}), 2, "description: "),
         (json.dumps({**BENCH, "k_cam_px": None}), 1, "exactly one of k_cam_px and lens"),

@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import Query
 from pydantic import Field
 
-from service.errors import BadRequest, FieldProblem
+from service.errors import BadRequest
 from service.storage.cameras import NAME_PATTERN
 
 PREFIX = "after:"
@@ -32,6 +32,6 @@ def name_of(cursor: str | None, pattern: str = NAME_PATTERN) -> str | None:
         text = ""
     name = text.removeprefix(PREFIX)
     if not text.startswith(PREFIX) or not re.fullmatch(pattern, name):
-        detail = "This cursor is none of ours: take next_cursor from the page before, or leave it out."
-        raise BadRequest(f"cursor: {detail}", errors=(FieldProblem("cursor", detail),))
+        detail = "This cursor is not valid here: take next_cursor from the previous page, or leave it out."
+        raise BadRequest.at(detail, "cursor")
     return name

@@ -7,6 +7,7 @@ from typing import Annotated, get_origin
 
 from fastapi import Depends, Header, Request, params
 from fastapi.dependencies.utils import get_flat_params
+from pydantic import Field
 
 from service.api.problems import invalid_request
 from service.api.texts import Worded
@@ -89,14 +90,17 @@ async def require_json(request: Request) -> None:
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     is_json = kind == "application/json" or (kind.startswith("application/") and kind.endswith("+json"))
     if not is_json and (kind or await request.body()):
-        raise UnsupportedKind(f"Send application/json, not {kind or 'a body without Content-Type'}.")
+        raise UnsupportedKind(f"Send JSON with the header Content-Type: application/json, not {kind or 'none'}.")
 
 
 IdempotencyKey = Annotated[
-    Annotated[str, Worded(r"^[!-~]+$", "a key has letters, digits and signs of ASCII, and no spaces")] | None,
+    Annotated[
+        str,
+        Field(min_length=1, max_length=255),
+        Worded(r"^[!-~]+$", "a key has ASCII letters, digits and punctuation, and no spaces"),
+    ]
+    | None,
     Header(
-        min_length=1,
-        max_length=255,
         description="Any text, new for every new request: the same request sent again with it is done once (for a day)",
     ),
 ]

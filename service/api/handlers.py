@@ -50,11 +50,11 @@ def _translated(request: Request, exc: Exception) -> CamindError:
     if isinstance(exc.__cause__, CamindError):
         return exc.__cause__
     if exc.status_code == 404:
-        return NotFound(f"There is nothing at {request.url.path[:200]}: GET /docs lists what there is.")
+        return NotFound(f"There is nothing at {request.url.path[:200]}: see /docs for what there is.")
     if exc.status_code == 405:
         allow = tuple(_allowed(request))
-        return MethodNotAllowed(f"This path answers {', '.join(allow)}.", allow=allow)
-    return BadRequest("The body cannot be read: send it whole, in the form its Content-Type names.")
+        return MethodNotAllowed(f"This path accepts only {', '.join(allow)}.", allow=allow)
+    return BadRequest("The body cannot be read: send all of it, in the format that its Content-Type names.")
 
 
 def _allowed(request: Request) -> Iterator[str]:

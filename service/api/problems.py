@@ -20,8 +20,12 @@ TYPE_PREFIX = "urn:camind:problem:"
 MAX_ERRORS = 50
 # pydantic's kinds of faults that are told in plainer words than its own
 A_NUMBER, A_WHOLE_NUMBER = "this must be a number", "this must be a whole number"
+AN_OBJECT = "this must be a JSON object"
 PLAIN_WORDS = {
-    "string_type": "this must be a text",
+    "missing": "this is required",
+    "model_type": AN_OBJECT,
+    "model_attributes_type": AN_OBJECT,
+    "string_type": "this must be a string",
     "float_type": A_NUMBER,
     "float_parsing": A_NUMBER,
     "finite_number": "this must be a finite number",
@@ -120,7 +124,7 @@ EXAMPLES: dict[str, tuple[str, tuple[FieldProblem, ...]]] = {
     "conflict": ("A camera 'd200' exists already: replace it with PUT /cameras/d200.", ()),
     "precondition-failed": ("Camera 'd200' is at revision 3: read it again, then repeat.", ()),
     "too-large": ("The request body may have at most 40000000 bytes.", ()),
-    "unsupported-kind": ("Send application/json, not text/plain.", ()),
+    "unsupported-kind": ("Send JSON with the header Content-Type: application/json, not text/plain.", ()),
     "not-acceptable": ("No format fits Accept: text/csv.", ()),
     "receive-timeout": ("The request body did not arrive within 30 s.", ()),
     "busy": ("16 images wait already: try again in a second.", ()),
@@ -177,8 +181,8 @@ def invalid_request(faults: Sequence[Mapping[str, Any]]) -> BadRequest:
     ordered = sorted(faults, key=lambda fault: bool(fault["type"] != "extra_forbidden"))
     fields = tuple(FieldProblem(_pointer(fault), _detail(fault)) for fault in ordered)
     first = fields[0]
-    where = first.pointer.removeprefix("#").strip("/").replace("/", ".")
-    return BadRequest(f"{where}: {first.detail}" if where else first.detail, errors=fields)
+    where = first.pointer.removeprefix("#").strip("/").replace("/", ".") or "body"
+    return BadRequest(f"{where}: {first.detail}", errors=fields)
 
 
 def invalid_model(exc: ValidationError, source: str) -> BadRequest:
@@ -197,23 +201,24 @@ def _pointer(fault: Mapping[str, Any]) -> str:
 
 def _detail(fault: Mapping[str, Any]) -> str:
     if fault["type"] == "json_invalid":
-        return f"This is no JSON: {fault['ctx']['error']} at character {fault['loc'][-1]}."
+        return f"this is not valid JSON: {fault['ctx']['error']} at character {fault['loc'][-1]}"
     if fault["type"] == "extra_forbidden":
         return _unknown_field(*map(str, fault["loc"]))
     words = PLAIN_WORDS.get(fault["type"], str(fault["msg"]))
     return printable(words.removeprefix("Value error, "))
 
 
-def _unknown_field(*path: str) -> str:
+def _unknown_field(source: str, *path: str) -> str:
     name = path[-1]
-    if path == ("body", name) and name in LENS_FIELDS:
-        return f'It belongs to the lens: send it there, as in {{"lens": {{"{name}": ...}}}}.'
+    if (source, path) == ("body", (name,)) and name in LENS_FIELDS:
+        return f'this belongs to the lens: send it there, as in {{"lens": {{"{name}": ...}}}}'
     if re.search("35_?mm|equivalent", name, re.IGNORECASE):
         return (
-            "A 35-mm-equivalent focal length is not the lens' focal length, and k_cam grows with its square: "
-            "send the real one as focal_length_mm (printed on the lens, and FocalLength in EXIF)."
+            "a 35-mm-equivalent focal length is not that of the lens, and k_cam grows with its square: "
+            "send the real one as focal_length_mm (printed on the lens, and FocalLength in EXIF)"
         )
-    return "There is no such field: remove it, or correct its name."
+    kind = "parameter" if source == "query" else "field"
+    return f"there is no such {kind}: remove it, or correct its name"
 
 
 def printable(part: object) -> str:

@@ -13,9 +13,9 @@ from service.storage.cameras import DEFAULT_K_R, NAME_PATTERN, CameraDraft, Came
 
 DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 PLAIN_TEXT = r"^[^\x00-\x08\x0b\x0c\x0e-\x1f\x7f]*$"
-NO_CONTROLS = "a description has no control characters but tabs and line breaks, and no half characters (surrogates)"
+NO_CONTROLS = "a description has no control characters except tabs and line breaks, and no unpaired surrogates"
 
-A_NAME = "a name has letters, digits, dots, dashes and underscores, 64 at most, and begins with a letter or digit"
+A_NAME = "a name has up to 64 letters, digits, dots, dashes and underscores, and begins with a letter or digit"
 
 Name = Annotated[
     str,
@@ -118,7 +118,7 @@ class CameraSpecs(Given):
         float, Field(ge=0, le=1_000, allow_inf_nan=False, description="Blur of a point in perfect focus")
     ] = 0.5
     intrinsics: PinholeIntrinsics | None = None
-    description: Annotated[Annotated[str, Worded(PLAIN_TEXT, NO_CONTROLS)] | None, Field(max_length=1000)] = None
+    description: Annotated[str, Field(max_length=1000), Worded(PLAIN_TEXT, NO_CONTROLS)] | None = None
 
     def to_draft(self, name: str) -> CameraDraft:
         """The camera under a name, with what it was made from; ``BadRequest`` where the numbers do not fit together."""
@@ -138,7 +138,7 @@ class CameraSpecs(Given):
                 intrinsics=intrinsics,
             )
         except (ValueError, ArithmeticError) as exc:
-            raise BadRequest.at(f"No camera has these numbers: {exc}.", "#") from exc
+            raise BadRequest.at(f"These numbers make no camera: {exc}.", "#") from exc
 
     def _k_cam_px(self, lens: Lens | None) -> float:
         if lens is None and self.k_cam_px is not None:
@@ -226,7 +226,10 @@ class CameraReplace(CameraSpecs):
     def to_named_draft(self, name: str) -> CameraDraft:
         """The draft for the camera in the URL; ``BadRequest`` where the body names another."""
         if self.name is not None and self.name != name:
-            raise BadRequest.at("The name differs from the URL's: a camera cannot be renamed.", "#/name")
+            raise BadRequest.at(
+                "This is not the name in the URL, and a camera cannot be renamed: send the same name, or none.",
+                "#/name",
+            )
         return self.to_draft(name)
 
 

@@ -86,8 +86,19 @@ def test_what_is_no_camera_is_refused(client: TestClient, content: bytes) -> Non
     assert all(fault["pointer"].startswith("#") for fault in body.get("errors", []))
 
 
-def test_an_empty_body_is_refused(client: TestClient) -> None:
-    require_problem(client.post("/cameras"), 422, "invalid-request")
+@pytest.mark.parametrize(
+    ("content", "detail"),
+    [
+        (b"", "body: this is required"),
+        (b"[]", "body: this must be a JSON object"),
+        (b"{", "body: this is not valid JSON: Expecting property name enclosed in double quotes at character 1"),
+    ],
+)
+def test_what_is_wrong_with_the_whole_body_is_told_of_the_body(client: TestClient, content: bytes, detail: str) -> None:
+    body = require_problem(
+        client.post("/cameras", content=content, headers=JSON if content else {}), 422, "invalid-request"
+    )
+    assert body["detail"] == detail
 
 
 @pytest.mark.parametrize("kind", ["text/plain", "image/jpeg", "multipart/form-data; boundary=x", "json", "text/json"])
@@ -135,11 +146,14 @@ def test_nothing_sent_is_echoed(client: TestClient, phone: dict[str, Any]) -> No
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"name": "no name"}, "a name has letters, digits, dots, dashes and underscores, 64 at most"),
-        ({"name": 7}, "this must be a text"),
+        ({"name": "no name"}, "a name has up to 64 letters, digits, dots, dashes and underscores"),
+        ({"name": 7}, "this must be a string"),
         ({"k_cam_px": "7"}, "this must be a number"),
         ({"image_width_px": 7.5}, "this must be a whole number"),
         ({"description": "\x00"}, "no control characters"),
+        ({"description": "x" * 1001}, "at most 1000 characters"),
+        ({"lens": []}, "this must be a JSON object"),
+        ({"colour": "black"}, "no such field"),
     ],
 )
 def test_a_fault_is_told_in_words_and_not_by_a_pattern(
@@ -153,15 +167,17 @@ def test_a_fault_is_told_in_words_and_not_by_a_pattern(
 def test_headers_and_parameters_are_told_of_in_words_too(client: TestClient, phone: dict[str, Any]) -> None:
     spaced = client.post("/cameras", json=phone, headers={"Idempotency-Key": "a b"})
     assert "no spaces" in require_problem(spaced, 422, "invalid-request")["detail"]
+    long = client.post("/cameras", json=phone, headers={"Idempotency-Key": "a" * 256})
+    assert "at most 255 characters" in require_problem(long, 422, "invalid-request")["detail"]
     named = client.post("/calibrate", params={"camera": "-"})
-    assert "a name has letters" in require_problem(named, 422, "invalid-request")["detail"]
+    assert "a name has up to 64 letters" in require_problem(named, 422, "invalid-request")["detail"]
     assert "whole number" in require_problem(client.get("/cameras?limit=x"), 422, "invalid-request")["detail"]
 
 
 @pytest.mark.parametrize(
     ("method", "path", "query", "name", "words"),
     [
-        ("GET", "/cameras", "limits=2", "limits", "no such"),
+        ("GET", "/cameras", "limits=2", "limits", "no such parameter"),
         ("GET", "/cameras", "limit=1&limit=2", "limit", "once"),
         ("GET", "/cameras/x", "points=2", "points", "no such"),
         ("GET", "/cameras/x/curve", "near=1", "near", "no such"),
