@@ -8,8 +8,12 @@ from typing import Any
 import pytest
 import yaml
 from fastapi import FastAPI
+from httpx2 import Response
+from starlette.testclient import TestClient
 
 from service.api.openapi import to_yaml
+from service.api.problems import PROBLEM_TYPE
+from tests.inference.photographs import corners, jpeg
 
 COMMITTED = Path(__file__).parents[1] / "openapi.yaml"
 METHODS = {"get", "put", "post", "delete", "patch"}
@@ -27,6 +31,14 @@ def operations(document: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
         for method, operation in item.items()
         if method in METHODS
     ]
+
+
+def problems_of(operation: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """The examples of its problems, by status and code."""
+    contents = {status: answer.get("content", {}) for status, answer in operation["responses"].items()}
+    return {
+        status: content[PROBLEM_TYPE]["examples"] for status, content in contents.items() if PROBLEM_TYPE in content
+    }
 
 
 def test_the_committed_file_is_the_app_s(document: dict[str, Any]) -> None:
@@ -74,6 +86,55 @@ def test_what_takes_a_body_documents_its_limits(document: dict[str, Any]) -> Non
     for name, operation in operations(document):
         if "requestBody" in operation:
             assert {"408", "413", "415", "422"} <= set(operation["responses"]), name
+
+
+def test_what_asks_for_a_key_documents_that_none_can_be_looked_up(document: dict[str, Any]) -> None:
+    for name, operation in operations(document):
+        if "security" in operation:
+            assert {"busy", "not-ready"} <= problems_of(operation)["503"].keys(), name
+
+
+def test_what_changes_something_documents_that_other_pages_may_not_and_what_reads_does_not(
+    document: dict[str, Any],
+) -> None:
+    for name, operation in operations(document):
+        assert ("cross-origin" in problems_of(operation).get("403", {})) != name.startswith("get "), name
+
+
+def test_what_is_answered_is_as_its_example(client: TestClient, document: dict[str, Any], d200: dict[str, Any]) -> None:
+    key, photograph = {"Idempotency-Key": "k"}, jpeg(corners(480, 640))
+    client.post("/cameras", json=d200)
+    client.post("/cameras", json=d200 | {"name": "other"}, headers=key)
+    for _ in range(2):
+        client.put("/cameras/d200", json=d200)
+
+    def depth(content: bytes, **headers: str) -> Response:
+        return client.post("/depth?camera=d200", content=content, headers={"Content-Type": "image/jpeg", **headers})
+
+    answers = [
+        client.post("/cameras", json=d200),
+        client.post("/cameras", json=d200 | {"lens": d200["lens"] | {"focal_length_mm": 0}}),
+        client.post("/cameras", json=d200 | {"name": "third"}, headers=key),
+        client.post("/cameras", content="d200", headers={"Content-Type": "text/plain"}),
+        client.put("/cameras/d200", json=d200, headers={"If-Match": '"2"'}),
+        client.delete("/cameras/d200", headers={"Origin": "http://elsewhere.example"}),
+        client.get("/cameras", headers={"Host": "elsewhere.example"}),
+        depth(photograph),
+        depth(photograph[:-2000]),
+        depth(photograph, Accept="text/csv"),
+        client.delete("/cameras/d200"),
+        client.get("/cameras/d200"),
+    ]
+    examples = {
+        code: example["value"]
+        for _, operation in operations(document)
+        for problems in problems_of(operation).values()
+        for code, example in problems.items()
+    }
+    refusals = [answer.json() for answer in answers if answer.status_code >= 400]
+    assert len({refusal["type"] for refusal in refusals}) == 11
+    for refusal in refusals:
+        assert refusal == examples[refusal["type"].removeprefix("urn:camind:problem:")]
 
 
 def test_operation_ids_are_plain_and_unique(document: dict[str, Any]) -> None:

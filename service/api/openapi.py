@@ -8,16 +8,26 @@ from typing import Any
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
-from service.access import is_public, needed_scope
-from service.api.problems import Problem, responses
-from service.errors import CrossOrigin, Forbidden, QuotaExceeded, ReceiveTimeout, TooLarge, Unauthorized, UnknownHost
+from service.access import READING, is_public, needed_scope
+from service.api.problems import PROBLEM_TYPE, STORE_ERRORS, Problem, responses
+from service.errors import (
+    CamindError,
+    CrossOrigin,
+    Forbidden,
+    QuotaExceeded,
+    ReceiveTimeout,
+    TooLarge,
+    Unauthorized,
+    UnknownHost,
+)
 
 # words that YAML reads as truth values or nothing
 YAML_WORDS = frozenset({"null", "true", "false", "yes", "no", "on", "off", "y", "n"})
 REF = "#/components/schemas/{model}"
 # what the limits in front of the routes answer
 BODY_ERRORS = (ReceiveTimeout, TooLarge)
-KEY_ERRORS = (Unauthorized, QuotaExceeded, UnknownHost)
+# what looking a key up in the database answers, or being asked without keys
+KEY_ERRORS = (Unauthorized, QuotaExceeded, UnknownHost, *STORE_ERRORS)
 API_KEY = "apiKey"
 SECURITY = {
     "type": "http",
@@ -50,7 +60,7 @@ def describe(app: FastAPI) -> dict[str, Any]:
         for path, operations in document["paths"].items():
             for method, operation in operations.items():
                 if not is_public(path):
-                    _secure(operation, needed_scope(method.upper(), path))
+                    _secure(operation, method.upper(), path)
                 _complete(operation)
         app.openapi_schema = document
     return app.openapi_schema
@@ -75,8 +85,7 @@ def _complete(operation: dict[str, Any]) -> None:
     for parameter in operation.get("parameters", ()):
         parameter["schema"] = _without_null(parameter["schema"])
     if "requestBody" in operation:
-        for status, answer in responses(*BODY_ERRORS).items():
-            operation["responses"].setdefault(str(status), answer)
+        _add_errors(operation, *BODY_ERRORS)
     for answer in operation["responses"].values():
         for content in answer.get("content", {}).values():
             if "itemSchema" in content:  # OpenAPI 3.1 knows no items of a stream
@@ -85,11 +94,22 @@ def _complete(operation: dict[str, Any]) -> None:
         answer.setdefault("headers", {})["X-Request-Id"] = REQUEST_ID_REF
 
 
-def _secure(operation: dict[str, Any], scope: str | None) -> None:
+def _secure(operation: dict[str, Any], method: str, path: str) -> None:
     """Say that a key is asked for, or none (``{}``), which scope it needs, and what happens without."""
+    scope = needed_scope(method, path)
     operation["security"] = [{API_KEY: [scope] if scope else []}, {}]
-    for status, answer in responses(*KEY_ERRORS, *([Forbidden, CrossOrigin] if scope else [])).items():
-        operation["responses"].setdefault(str(status), answer)
+    _add_errors(operation, *KEY_ERRORS)
+    if scope:
+        _add_errors(operation, Forbidden)
+    if method not in READING:
+        _add_errors(operation, CrossOrigin)
+
+
+def _add_errors(operation: dict[str, Any], *errors: type[CamindError]) -> None:
+    """Document these too; of a status that the route has itself they are further examples."""
+    for status, answer in responses(*errors).items():
+        known = operation["responses"].setdefault(str(status), answer)["content"][PROBLEM_TYPE]["examples"]
+        known.update(answer["content"][PROBLEM_TYPE]["examples"])
 
 
 def _without_null(schema: dict[str, Any]) -> dict[str, Any]:

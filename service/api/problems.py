@@ -38,6 +38,13 @@ LENS_FIELDS = frozenset(field.name for field in fields(Lens))
 # what reading the database may answer, and what writing to it may
 STORE_ERRORS = (Busy, NotReady)
 WRITE_ERRORS = (*STORE_ERRORS, InsufficientStorage)
+# by status, a header's name, type and meaning
+ERROR_HEADERS = {
+    401: ("WWW-Authenticate", "string", "What is asked for"),
+    403: ("WWW-Authenticate", "string", "The scope that the key lacks; `cross-origin` has none"),
+    429: ("Retry-After", "integer", "Seconds to wait"),
+    503: ("Retry-After", "integer", "Seconds to wait; `not-ready` has none"),
+}
 
 
 class ProblemField(BaseModel):
@@ -101,14 +108,15 @@ def problem_response(error: CamindError) -> Response:
     return response
 
 
+TAKEN = "A camera 'd200' exists already: replace it with PUT /cameras/d200."
 EXAMPLES: dict[str, tuple[str, tuple[FieldProblem, ...]]] = {
     "invalid-request": (
         "lens.focal_length_mm: Input should be greater than or equal to 0.01",
         (FieldProblem("#/lens/focal_length_mm", "Input should be greater than or equal to 0.01"),),
     ),
-    "invalid-image": ("The JPEG ends before its last row: send the whole file.", ()),
+    "invalid-image": ("The jpeg file is cut off: it ends before the picture does.", ()),
     "image-size-mismatch": (
-        "The image is 640 x 480 and camera 'd200' is 645 x 432: send the whole frame, resized at most.",
+        "The photograph has 640x480 pixels upright, the camera 645x432: send the whole frame, not a crop.",
         (),
     ),
     "idempotency-key-reused": (
@@ -120,15 +128,19 @@ EXAMPLES: dict[str, tuple[str, tuple[FieldProblem, ...]]] = {
     "unknown-host": ("The service is not known by this name: add it to CAMIND_HOSTS, or serve with API keys.", ()),
     "cross-origin": ("A page of another site asked for this; only the service's own page may.", ()),
     "quota-exceeded": ("This API key has had its 600 requests of this minute.", ()),
-    "not-found": ("There is no camera 'd200'.", ()),
-    "conflict": ("A camera 'd200' exists already: replace it with PUT /cameras/d200.", ()),
+    "not-found": ("There is no camera 'd200': register it with POST /cameras.", ()),
+    "conflict": (TAKEN, (FieldProblem("#/name", TAKEN),)),
     "precondition-failed": ("Camera 'd200' is at revision 3: read it again, then repeat.", ()),
     "too-large": ("The request body may have at most 40000000 bytes.", ()),
     "unsupported-kind": ("Send JSON with the header Content-Type: application/json, not text/plain.", ()),
-    "not-acceptable": ("No format fits Accept: text/csv.", ()),
+    "not-acceptable": (
+        "No format fits this Accept header: ask for one of image/png, application/x-npy, application/x-npz, "
+        "image/tiff, application/x-ply, image/jpeg, application/json.",
+        (),
+    ),
     "receive-timeout": ("The request body did not arrive within 30 s.", ()),
-    "busy": ("16 images wait already: try again in a second.", ()),
-    "not-ready": ("The database takes no writes.", ()),
+    "busy": ("17 requests run or wait, with room for no more: try again later.", ()),
+    "not-ready": ("The database cannot be used: the service's log says why.", ()),
     "insufficient-storage": (
         "The database's disk is full and nothing was stored: try again when there is room.",
         (),
@@ -156,10 +168,9 @@ def _empty_entry(error: type[CamindError]) -> dict[str, Any]:
         "description": error.title,
         "content": {PROBLEM_TYPE: {"schema": schema, "examples": {}}},
     }
-    if error.status in (429, 503):
-        entry["headers"] = {"Retry-After": {"description": "Seconds to wait", "schema": {"type": "integer"}}}
-    if error.status in (401, 403):
-        entry["headers"] = {"WWW-Authenticate": {"description": "What is asked for", "schema": {"type": "string"}}}
+    if error.status in ERROR_HEADERS:
+        name, kind, meaning = ERROR_HEADERS[error.status]
+        entry["headers"] = {name: {"description": meaning, "schema": {"type": kind}}}
     return entry
 
 
