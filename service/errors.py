@@ -79,7 +79,7 @@ class InvalidImage(BadRequest):
 
 class ImageSizeMismatch(BadRequest):
     code = "image-size-mismatch"
-    title = "Image is not the camera's frame"
+    title = "Image does not fit the camera"
 
 
 class KeyReused(BadRequest):
@@ -114,13 +114,13 @@ class Forbidden(CamindError):
 class CrossOrigin(CamindError):
     status = 403
     code = "cross-origin"
-    title = "Asked by another site's page"
+    title = "Request from another site's page"
 
 
 class UnknownHost(CamindError):
     status = 421
     code = "unknown-host"
-    title = "Asked for by an unknown name"
+    title = "Unknown host name"
 
 
 class NotFound(CamindError):
