@@ -242,26 +242,24 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize("bad", BAD)
 @pytest.mark.parametrize("name", NUMBERS)
-def test_no_number_of_a_camera_may_be_nonsense(client: TestClient, phone: dict[str, Any], name: str, bad: str) -> None:
-    body = _json_with(phone, name, bad)
-    answer = client.post("/cameras", content=body, headers={"Content-Type": "application/json"})
-    assert answer.status_code == 422
-    assert answer.headers["content-type"] == PROBLEM
-    if len(bad) < 1000:
-        assert answer.json()["errors"][0]["pointer"] == f"#/{name}"
+def test_no_number_of_a_camera_may_be_nonsense(client: TestClient, phone: dict[str, Any], name: str) -> None:
+    for bad in BAD:
+        require_pointed_at(client, _json_with(phone, name, bad), f"#/{name}", bad)
 
 
-@pytest.mark.parametrize("bad", BAD)
 @pytest.mark.parametrize("name", LENS_NUMBERS)
-def test_no_number_of_a_lens_may_be_nonsense(client: TestClient, d200: dict[str, Any], name: str, bad: str) -> None:
-    lens = _json_with(d200["lens"], name, bad)
-    body = _json_with(d200, "lens", lens)
+def test_no_number_of_a_lens_may_be_nonsense(client: TestClient, d200: dict[str, Any], name: str) -> None:
+    for bad in BAD:
+        lens = _json_with(d200["lens"], name, bad)
+        require_pointed_at(client, _json_with(d200, "lens", lens), f"#/lens/{name}", bad)
+
+
+def require_pointed_at(client: TestClient, body: str, pointer: str, bad: str) -> None:
     answer = client.post("/cameras", content=body, headers={"Content-Type": "application/json"})
-    assert answer.status_code == 422
-    if len(bad) < 1000:
-        assert answer.json()["errors"][0]["pointer"] == f"#/lens/{name}"
+    assert (answer.status_code, answer.headers["content-type"]) == (422, PROBLEM), bad[:40]
+    if len(bad) < 1000:  # of more digits Python makes no number, and the JSON as a whole is refused
+        assert answer.json()["errors"][0]["pointer"] == pointer, bad
 
 
 @pytest.mark.parametrize("gamma_px", ["-0.1", "NaN", "Infinity"])
