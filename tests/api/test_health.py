@@ -1,4 +1,4 @@
-"""Health, the model's page, and the rest that is only read."""
+"""Health, the model that answers, and what a restart keeps."""
 
 import json
 from pathlib import Path
@@ -50,14 +50,6 @@ def test_the_model_shows_its_manifest_and_card(client: TestClient, tiny_model_di
     answer = client.get("/model").json()
     assert answer["manifest"] == json.loads((tiny_model_dir / "manifest.json").read_text())
     assert answer["card"] == (tiny_model_dir / "MODEL_CARD.md").read_text()
-
-
-def test_the_page_and_the_docs_are_there(client: TestClient) -> None:
-    page = client.get("/")
-    assert page.headers["content-type"].startswith("text/html")
-    assert 'href="docs"' in page.text
-    assert client.get("/docs").status_code == 200
-    assert client.get("/openapi.json").json()["info"]["title"] == "camind"
 
 
 def test_a_stopped_service_starts_again_with_its_cameras(app: FastAPI, settings: Settings) -> None:

@@ -1,4 +1,4 @@
-"""What ``GET /metrics`` says of queues, slots, calibrations, refusals and the process, at the moment it is asked."""
+"""What ``GET /metrics`` says of requests, queues, slots, calibrations, refusals and the process when it is asked."""
 
 import threading
 from collections.abc import Iterator
@@ -39,6 +39,23 @@ def released() -> Iterator[threading.Event]:
     event = threading.Event()
     yield event
     event.set()
+
+
+def test_metrics_count_by_path_template(client: TestClient, phone: dict[str, Any]) -> None:
+    client.post("/cameras", json=phone)
+    for name in ("pixel7-wide", "a", "b"):
+        client.get(f"/cameras/{name}")
+    client.get("/wp-admin")
+    client.request("BREW", "/coffee")
+    answer = client.get("/metrics")
+    assert answer.headers["content-type"].startswith("text/plain")
+    lines = answer.text.splitlines()
+    assert 'camind_requests_total{method="GET",path="/cameras/{name}",status="200"} 1.0' in lines
+    assert 'camind_requests_total{method="GET",path="/cameras/{name}",status="404"} 2.0' in lines
+    assert 'camind_requests_total{method="GET",path="unmatched",status="404"} 1.0' in lines
+    assert 'camind_requests_total{method="other",path="unmatched",status="404"} 1.0' in lines
+    assert "wp-admin" not in answer.text
+    assert "process_resident_memory_bytes" in answer.text
 
 
 def test_slots_and_queue_are_as_they_are_now(client: TestClient, app: FastAPI, released: threading.Event) -> None:

@@ -16,6 +16,7 @@ def test_a_page_loads_nothing_from_elsewhere_and_lacks_nothing(client: TestClien
     assert {client.get(address).status_code for address in loaded} <= {200}
 
 
-def test_the_docs_show_the_description_the_app_serves(client: TestClient) -> None:
+def test_the_page_leads_to_docs_that_show_the_description_the_app_serves(client: TestClient) -> None:
+    assert 'href="docs"' in client.get("/").text
     assert "/openapi.json" in client.get("/docs").text
     assert "/depth" in client.get("/openapi.json").json()["paths"]
