@@ -18,7 +18,6 @@ from httpx2 import Response
 from numpy.typing import NDArray
 from starlette.testclient import TestClient
 
-from service.config import Settings
 from service.inference.cancellation import Cancellation
 from service.inference.encode import MEDIA_TYPES
 from service.inference.worker import Worker
@@ -399,15 +398,32 @@ def test_a_point_outside_the_part_is_refused(bench: TestClient) -> None:
     refused(ask(bench, format="json", roi="10,20,41,50", at="9,21"), 422, "(9, 21)", "(10, 20) to (41, 50)")
 
 
-def test_no_room_is_503_with_retry_after(settings: Settings, app: FastAPI) -> None:
-    with TestClient(app) as client:
-        client.post("/cameras", json=CAMERA)
-        app.state.worker.close()
-        app.state.worker = Worker(slots=1, queue_size=0, deadline_s=1e-6)
-        response = ask(client)
-        refused(response, 503, "No answer within")
-        assert int(response.headers["retry-after"]) >= 1
-    assert settings.queue_size > 0
+def test_a_deadline_that_passes_is_503_with_retry_after(app: FastAPI, bench: TestClient) -> None:
+    replace_worker(app, deadline_s=1e-6)
+    response = ask(bench)
+    refused(response, 503, "No answer within")
+    assert int(response.headers["retry-after"]) >= 1
+
+
+def test_a_full_queue_is_503_with_retry_after(app: FastAPI, bench: TestClient) -> None:
+    worker, release = replace_worker(app, deadline_s=10), threading.Event()
+    assert bench.portal is not None
+    held = bench.portal.start_task_soon(worker.run, lambda _: release.wait(10))
+    while not worker.in_flight:
+        pass
+    response = ask(bench)
+    refused(response, 503, "with room for no more")
+    assert int(response.headers["retry-after"]) >= 1
+    release.set()
+    assert held.result(10).value
+    assert ask(bench).status_code == 200
+
+
+def replace_worker(app: FastAPI, deadline_s: float) -> Worker:
+    """A worker of one slot and no queue, from now on the running app's."""
+    app.state.worker.close()
+    app.state.worker = worker = Worker(slots=1, queue_size=0, deadline_s=deadline_s)
+    return worker
 
 
 def test_a_form_touches_no_disk(client: TestClient, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
