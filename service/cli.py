@@ -245,6 +245,9 @@ def depth(
     side: Literal["auto", "near", "far"] = "auto",
     focus_distance_m: Annotated[float | None, typer.Option(help="Theirs, if not the camera's")] = None,
     at: Annotated[list[str] | None, typer.Option(help="Pixel u,v to read; may be repeated")] = None,
+    maps: Annotated[
+        list[str] | None, typer.Option(help="Map that an npz holds; may be repeated. [default: all]")
+    ] = None,
     known: Annotated[list[str] | None, typer.Option(help="Known depth u,v,depth_m; may be repeated")] = None,
     roi: Annotated[str | None, typer.Option(help="Part u0,v0,u1,v1 to answer alone")] = None,
     only_missing: Annotated[bool, typer.Option("--only-missing", help="Leave out what is there already")] = False,
@@ -260,7 +263,8 @@ def depth(
         from service.depth_folder import Errand, depth_folder, query_of
         from service.inference.images import ImageLimits
 
-    asked = {"side": side, "focus_distance_m": focus_distance_m, "at": at or (), "known": known or (), "roi": roi}
+    lists = {"at": at or (), "maps": maps or (), "known": known or ()}
+    asked = {"side": side, "focus_distance_m": focus_distance_m, "roi": roi, **lists}
     try:
         query = query_of(camera, asked, formats)
         with _plain_failures():

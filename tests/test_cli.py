@@ -342,6 +342,7 @@ def test_a_table_tells_photographs_of_any_name_apart(bench: Path, tiny_model_dir
         (("photos", "--camera", "other"), 1, "no camera 'other'"),
         (("photos", "--camera", "bench", "--format", "gif"), 2, "format: "),
         (("photos", "--camera", "bench", "--known", "1,2"), 2, "known.0: "),
+        (("photos", "--camera", "bench", "--maps", "depth"), 2, "maps.0: "),
         (("photos", "--camera", "bench", "--out", "photos"), 2, "photos holds photographs"),
         (("photos", "others/a.jpg", "--camera", "bench"), 2, "would become one file"),
         (("empty", "--camera", "bench"), 2, "no photographs in empty"),

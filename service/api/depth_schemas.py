@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from service.api.texts import Worded, numbers_in
+from service.inference.encode import MAPS, MapName
 from service.inference.known import KnownDepth
 from service.inference.pair import Side
 from service.inference.part import Part
@@ -72,6 +73,10 @@ class DepthQuery(BaseModel):
     at: Annotated[
         tuple[Point, ...],
         Field(max_length=MAX_POINTS, description="Pixels u,v to read, repeatable; answered in json"),
+    ] = ()
+    maps: Annotated[
+        tuple[MapName, ...],
+        Field(max_length=len(MAPS), description="Maps that an npz holds, repeatable; without it all of them"),
     ] = ()
     roi: Annotated[
         Corners | None,

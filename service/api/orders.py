@@ -9,7 +9,7 @@ from service.api.uploads import Upload
 from service.errors import BadRequest
 from service.inference.cancellation import Cancellation
 from service.inference.depth_map import DepthMap
-from service.inference.encode import ENCODERS, MEDIA_TYPES, Encoded, pixel_at, read_point, spread_of
+from service.inference.encode import ENCODERS, MAPS, MEDIA_TYPES, Beside, Encoded, pixel_at, read_point, spread_of
 from service.inference.estimator import Estimator
 from service.inference.frame import camera_of, maybe_seen_narrower, taken_otherwise
 from service.inference.images import ImageLimits, read_photograph
@@ -80,11 +80,12 @@ def fulfil(cancellation: Cancellation, order: Order, estimator: Estimator) -> An
     depth_map = estimator.estimate(photograph.rgb, camera, order.query.side, cancellation, order.query.part, known)
     stopwatch.add(depth_map.timings_ms)
     warnings = (*order.warnings, *photograph.warnings, *taken, *seen, *resized, *depth_map.warnings)
+    beside = Beside(part.of(photograph.rgb), order.query.maps or MAPS)
     with stopwatch.stage("encode"):
         encoded = tuple(
             _as_json(depth_map, order, part, estimator.manifest.name, warnings)
             if wanted == JSON
-            else ENCODERS[wanted](depth_map, part.of(photograph.rgb))
+            else ENCODERS[wanted](depth_map, beside)
             for wanted in order.formats
         )
     lost = (words for one in encoded for words in one.warnings)

@@ -5,9 +5,9 @@ Units and the sign for no answer are those of ROS REP 118: float metres with NaN
 
 import io
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import tifffile
@@ -29,6 +29,8 @@ SAMPLES = 2**16
 UNDISTORTING = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-6)
 LENS_CELL_PX, MOST_OFF_PX = 8, 0.5
 PERCENTILES = (0, 5, 50, 95, 100)
+MapName = Literal["depth_m", "depth_alt_m", "p_near", "sigma_m", "blur_px", "valid"]
+MAPS: tuple[MapName, ...] = get_args(MapName)
 MEDIA_TYPES: dict[str, str] = {
     "png": "image/png",
     "npy": "application/x-npy",
@@ -47,6 +49,14 @@ class Encoded:
     media_type: str
     depth_scale_m: float = 1.0
     warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Beside:
+    """What goes into files beside depth: the photograph's colours [h, w, 3] into points, these maps into an npz."""
+
+    rgb: NDArray[np.uint8]
+    maps: Sequence[MapName] = MAPS
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +82,7 @@ class Spread:
     max: float | None
 
 
-def encode_png(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
+def encode_png(answer: DepthMap, _: Beside) -> Encoded:
     """16-bit grey, millimetres along z; 0 is no answer, which includes what lies beyond 65.535 m."""
     size = answer.height_px, answer.width_px
     levels, beyond = np.empty(size, np.uint16), 0
@@ -103,42 +113,34 @@ def _coarse(levels: NDArray[np.uint16]) -> tuple[str, ...]:
     )
 
 
-def encode_npy(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
+def encode_npy(answer: DepthMap, _: Beside) -> Encoded:
     """float32 metres [height, width], NaN where there is no answer."""
     stream = io.BytesIO()
     np.save(stream, answer.depth_m, allow_pickle=False)
     return Encoded(stream.getvalue(), MEDIA_TYPES["npy"])
 
 
-def encode_npz(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
-    """All maps by their names, ``K`` float64 [3, 3], NaN and a warning if unknown, ``distortion`` if there is any."""
+def encode_npz(answer: DepthMap, beside: Beside) -> Encoded:
+    """Maps by their names, ``K`` float64 [3, 3], NaN and a warning if unknown, ``distortion`` if there is any."""
     distortion = _distortion(answer)
     matrix = camera_matrix(answer)
     unknown = () if np.isfinite(matrix).all() else ("the camera has no focal length in pixels: K is NaN",)
-    more: dict[str, Any] = {"distortion": distortion} if distortion.any() else {}
+    arrays: dict[str, Any] = {name: getattr(answer, name) for name in beside.maps} | {"K": matrix}
+    if distortion.any():
+        arrays["distortion"] = distortion
     stream = io.BytesIO()
-    np.savez(
-        stream,
-        depth_m=answer.depth_m,
-        depth_alt_m=answer.depth_alt_m,
-        p_near=answer.p_near,
-        sigma_m=answer.sigma_m,
-        blur_px=answer.blur_px,
-        valid=answer.valid,
-        K=matrix,
-        **more,
-    )
+    np.savez(stream, **arrays)
     return Encoded(stream.getvalue(), MEDIA_TYPES["npz"], warnings=unknown)
 
 
-def encode_tiff(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
+def encode_tiff(answer: DepthMap, _: Beside) -> Encoded:
     """float32 metres, one page, uncompressed; NaN where there is no answer."""
     stream = io.BytesIO()
     tifffile.imwrite(stream, answer.depth_m, photometric="minisblack")
     return Encoded(stream.getvalue(), MEDIA_TYPES["tiff"])
 
 
-def encode_ply(answer: DepthMap, rgb: NDArray[np.uint8]) -> Encoded:
+def encode_ply(answer: DepthMap, beside: Beside) -> Encoded:
     """Binary little-endian points in metres (x right, y down, z forward) with the photograph's colours.
 
     Raises ``BadRequest`` without intrinsics: no focal length, no points.
@@ -156,14 +158,14 @@ def encode_ply(answer: DepthMap, rgb: NDArray[np.uint8]) -> Encoded:
     )
     points["x"], points["y"] = _rays(answer, u, v) * z
     points["z"] = z
-    points["red"], points["green"], points["blue"] = rgb[v, u].T
+    points["red"], points["green"], points["blue"] = beside.rgb[v, u].T
     lost = (
         f"{1 - is_met.mean():.1%} of the points are left out: by the camera's distortion no ray meets the sensor there"
     )
     return Encoded(_ply_header(len(z)) + points.tobytes(), MEDIA_TYPES["ply"], warnings=() if is_met.all() else (lost,))
 
 
-def encode_preview(answer: DepthMap, _: NDArray[np.uint8]) -> Encoded:
+def encode_preview(answer: DepthMap, _: Beside) -> Encoded:
     """JPEG in turbo colours, near red and far blue, grey without an answer, with a legend in metres."""
     return _jpeg(render_preview(answer.depth_m))
 
@@ -183,7 +185,7 @@ def _jpeg(rgb: NDArray[np.uint8]) -> Encoded:
     return Encoded(body.tobytes(), MEDIA_TYPES["preview"])
 
 
-ENCODERS: dict[str, Callable[[DepthMap, NDArray[np.uint8]], Encoded]] = {
+ENCODERS: dict[str, Callable[[DepthMap, Beside], Encoded]] = {
     "png": encode_png,
     "npy": encode_npy,
     "npz": encode_npz,

@@ -116,6 +116,13 @@ def test_every_format_tells_the_same_metres(bench: TestClient) -> None:
         assert float(response.headers["Camind-Depth-Scale-M"]) == (0.001 if name == "png" else 1)
 
 
+def test_an_npz_has_the_maps_asked_for(bench: TestClient) -> None:
+    response = ask(bench, format="npz", maps=["depth_m", "sigma_m"])
+    with np.load(io.BytesIO(response.content)) as stored:
+        assert set(stored) == {"depth_m", "sigma_m", "K"}
+    assert len(response.content) < 0.5 * len(ask(bench, format="npz").content)
+
+
 def test_json_has_exactly_the_numbers_of_the_design(bench: TestClient) -> None:
     answer = ask(bench, format="json", at=["12,7", "95.4,0"]).json()
     assert set(answer) == {
@@ -305,6 +312,7 @@ def test_known_depths_are_of_the_whole_whatever_part_is_asked_for(bench: TestCli
         ({"at": "nan,1"}, "u,v"),
         ({"at": "96,3", "format": "json"}, "(0, 0) to (96, 64)"),
         ({"at": "3,-1", "format": "json"}, "(0, 0) to (96, 64)"),
+        ({"maps": "depth"}, "depth_m"),
         ({"known": "3,4"}, "u,v,depth_m"),
         ({"known": "3,4,0"}, "u,v,depth_m"),
         ({"known": "3,4,-1"}, "u,v,depth_m"),
@@ -489,5 +497,5 @@ def test_the_document_lists_every_form_and_every_kind(client: TestClient) -> Non
     assert {"image/jpeg", "image/png", "multipart/form-data"} <= set(operation["requestBody"]["content"])
     assert {"404", "406", "413", "415", "422", "503"} <= set(operation["responses"])
     assert {parameter["name"] for parameter in operation["parameters"]} == {
-        *("camera", "side", "format", "at", "roi", "focus_distance_m", "known")
+        *("camera", "side", "format", "at", "maps", "roi", "focus_distance_m", "known")
     }

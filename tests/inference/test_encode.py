@@ -13,6 +13,7 @@ from service.inference.depth_map import DepthMap, Layers
 from service.inference.encode import (
     ENCODERS,
     MEDIA_TYPES,
+    Beside,
     encode_npy,
     encode_npz,
     encode_ply,
@@ -28,6 +29,7 @@ from service.optics.camera import Camera, Intrinsics
 
 CAMERA = Camera(40, 30, 2.0, 6.0, intrinsics=Intrinsics(50.0, 52.0, 19.5, 14.5))
 RGB = np.random.default_rng(1).integers(0, 255, (30, 40, 3), np.uint8)
+BESIDE = Beside(RGB)
 
 
 @pytest.fixture
@@ -56,7 +58,7 @@ def read_png(body: bytes) -> NDArray[np.uint16]:
 
 
 def test_png_holds_millimetres_and_zero_for_no_answer(answer: DepthMap) -> None:
-    encoded = encode_png(answer, RGB)
+    encoded = encode_png(answer, BESIDE)
     pixels = read_png(encoded.body)
     assert encoded.depth_scale_m == 0.001
     assert pixels[0, 0] == 0
@@ -73,7 +75,7 @@ def test_png_has_no_answer_beyond_what_it_can_hold_and_says_so(answer: DepthMap)
     answer.depth_m[5, 5] = 65.535
     answer.depth_m[5, 6] = 70.0
     answer.depth_m[5, 7] = np.inf
-    encoded = encode_png(answer, RGB)
+    encoded = encode_png(answer, BESIDE)
     np.testing.assert_array_equal(read_png(encoded.body)[5, 5:8], (65535, 0, 0))
     assert "65.535 m" in encoded.warnings[0]
 
@@ -82,39 +84,50 @@ def test_png_says_where_a_millimetre_is_coarse(answer: DepthMap) -> None:
     said = "nine tenths of the depths lie within 8 mm, and a 16-bit PNG holds whole millimetres"
     for nearest_m, relief_m, is_coarse in ((0.06, 0.01, True), (0.06, 0.1, False), (2.0, 0.01, False)):
         answer.depth_m[:] = np.linspace(nearest_m, nearest_m + relief_m, 1200).reshape(30, 40)
-        warnings = encode_png(answer, RGB).warnings
+        warnings = encode_png(answer, BESIDE).warnings
         assert [warning.startswith(said) for warning in warnings] == [True] * is_coarse
     answer.valid[:] = False
-    assert encode_png(answer, RGB).warnings == ()
+    assert encode_png(answer, BESIDE).warnings == ()
 
 
 def test_npy_and_tiff_hold_the_very_floats(answer: DepthMap) -> None:
     for pixels in (
-        np.load(io.BytesIO(encode_npy(answer, RGB).body), allow_pickle=False),
-        tifffile.imread(io.BytesIO(encode_tiff(answer, RGB).body)),
+        np.load(io.BytesIO(encode_npy(answer, BESIDE).body), allow_pickle=False),
+        tifffile.imread(io.BytesIO(encode_tiff(answer, BESIDE).body)),
     ):
         assert pixels.dtype == np.float32
         np.testing.assert_array_equal(pixels, answer.depth_m)
 
 
 def test_npz_holds_all_maps_and_the_camera_matrix(answer: DepthMap) -> None:
-    with np.load(io.BytesIO(encode_npz(answer, RGB).body), allow_pickle=False) as stored:
+    with np.load(io.BytesIO(encode_npz(answer, BESIDE).body), allow_pickle=False) as stored:
         assert set(stored) == {"depth_m", "depth_alt_m", "p_near", "sigma_m", "blur_px", "valid", "K"}
         np.testing.assert_array_equal(stored["depth_alt_m"], answer.depth_alt_m)
         np.testing.assert_array_equal(stored["valid"], answer.valid)
         np.testing.assert_array_equal(stored["K"], [[50, 0, 19.5], [0, 52, 14.5], [0, 0, 1]])
 
 
+def test_an_npz_holds_the_maps_that_are_asked_for_and_the_camera_matrix(answer: DepthMap) -> None:
+    def never() -> Layers:
+        raise AssertionError("nothing of the layers was asked for")
+
+    unread = replace(answer, layers=never)
+    body = encode_npz(unread, Beside(RGB, ("valid", "depth_m", "depth_m"))).body
+    with np.load(io.BytesIO(body)) as stored:
+        assert set(stored) == {"depth_m", "valid", "K"}
+        np.testing.assert_array_equal(stored["depth_m"], answer.depth_m)
+
+
 def test_unknown_intrinsics_are_nan_in_npz_and_no_point_cloud(answer: DepthMap) -> None:
     blind = replace(answer, camera=replace(CAMERA, intrinsics=None))
-    with np.load(io.BytesIO(encode_npz(blind, RGB).body)) as stored:
+    with np.load(io.BytesIO(encode_npz(blind, BESIDE).body)) as stored:
         assert np.isnan(stored["K"]).sum() == 4
     with pytest.raises(BadRequest, match="focal length"):
-        encode_ply(blind, RGB)
+        encode_ply(blind, BESIDE)
 
 
 def test_ply_points_project_back_to_their_pixels(answer: DepthMap) -> None:
-    head, _, body = encode_ply(answer, RGB).body.partition(b"end_header\n")
+    head, _, body = encode_ply(answer, BESIDE).body.partition(b"end_header\n")
     assert b"element vertex 1199\n" in head
     kinds = [(axis, "<f4") for axis in "xyz"] + [(colour, "u1") for colour in "rgb"]
     points = np.frombuffer(body, np.dtype(kinds))
@@ -127,7 +140,7 @@ def test_ply_points_project_back_to_their_pixels(answer: DepthMap) -> None:
 def test_points_leave_the_lens_distortion_out(answer: DepthMap) -> None:
     distortion = (-0.2, 0.05, 1e-3, -2e-3, 0.01)
     bent = replace(answer, camera=replace(CAMERA, intrinsics=Intrinsics(50.0, 52.0, 19.5, 14.5, distortion)))
-    body = encode_ply(bent, RGB).body.partition(b"end_header\n")[2]
+    body = encode_ply(bent, BESIDE).body.partition(b"end_header\n")[2]
     kinds = [(axis, "<f4") for axis in "xyz"] + [(colour, "u1") for colour in "rgb"]
     points = np.frombuffer(body, np.dtype(kinds))
     matrix = np.array([[50.0, 0, 19.5], [0, 52.0, 14.5], [0, 0, 1]])
@@ -140,7 +153,7 @@ def test_points_leave_the_lens_distortion_out(answer: DepthMap) -> None:
     )
     v, u = np.nonzero(bent.valid)
     np.testing.assert_allclose(np.asarray(places)[:, 0], np.stack([u, v], 1), atol=0.01)
-    with np.load(io.BytesIO(encode_npz(bent, RGB).body)) as stored:
+    with np.load(io.BytesIO(encode_npz(bent, BESIDE).body)) as stored:
         np.testing.assert_array_equal(stored["distortion"], distortion)
 
 
@@ -149,7 +162,7 @@ def test_what_no_ray_is_distorted_to_is_no_point(answer: DepthMap) -> None:
     folding = replace(
         answer, camera=replace(CAMERA, intrinsics=Intrinsics(38.0, 38.0, -10.0, 14.5, (-0.3, 0, 0, 0, 0)))
     )
-    told = encode_ply(folding, RGB)
+    told = encode_ply(folding, BESIDE)
     head, _, body = told.body.partition(b"end_header\n")
     points = np.frombuffer(body, np.dtype([(axis, "<f4") for axis in "xyz"] + [(colour, "u1") for colour in "rgb"]))
     assert 200 < len(points) < np.count_nonzero(answer.valid)
@@ -166,14 +179,14 @@ def test_all_that_a_wide_lens_sees_is_a_point(answer: DepthMap) -> None:
     wide = replace(
         answer, camera=replace(CAMERA, intrinsics=Intrinsics(20.0, 20.0, 19.5, 14.5, (-0.29, 0.08, 0, 0, 0)))
     )
-    told = encode_ply(wide, RGB)
+    told = encode_ply(wide, BESIDE)
     assert told.warnings == ()
     assert f"element vertex {np.count_nonzero(answer.valid)}\n".encode() in told.body
 
 
 def test_preview_is_near_red_far_blue_and_grey_without_an_answer(answer: DepthMap) -> None:
     answer.depth_m[:8, :8] = np.nan
-    pixels = cv2.imdecode(np.frombuffer(encode_preview(answer, RGB).body, np.uint8), cv2.IMREAD_COLOR_RGB)
+    pixels = cv2.imdecode(np.frombuffer(encode_preview(answer, BESIDE).body, np.uint8), cv2.IMREAD_COLOR_RGB)
     assert pixels is not None
     assert pixels.shape == (30, 40, 3)
     nothing, near, far = (pixels[v, u].astype(int) for v, u in ((3, 3), (3, 30), (27, 20)))
@@ -185,11 +198,11 @@ def test_preview_is_near_red_far_blue_and_grey_without_an_answer(answer: DepthMa
 @pytest.mark.parametrize("level", [np.nan, 1.5])
 def test_preview_of_nothing_or_of_one_depth_is_a_picture_too(answer: DepthMap, level: float) -> None:
     flat = replace(answer, depth_m=np.full((200, 220), level, np.float32))
-    assert encode_preview(flat, RGB).body.startswith(b"\xff\xd8\xff")
+    assert encode_preview(flat, BESIDE).body.startswith(b"\xff\xd8\xff")
 
 
 def test_every_format_states_its_media_type(answer: DepthMap) -> None:
-    assert {name: encode(answer, RGB).media_type for name, encode in ENCODERS.items()} == MEDIA_TYPES
+    assert {name: encode(answer, BESIDE).media_type for name, encode in ENCODERS.items()} == MEDIA_TYPES
 
 
 def test_spread_is_that_of_the_pixels_with_an_answer(answer: DepthMap) -> None:
