@@ -80,7 +80,8 @@ def fulfil(cancellation: Cancellation, order: Order, estimator: Estimator) -> An
     depth_map = estimator.estimate(photograph.rgb, camera, order.query.side, cancellation, order.query.part, known)
     stopwatch.add(depth_map.timings_ms)
     warnings = (*order.warnings, *photograph.warnings, *taken, *seen, *resized, *depth_map.warnings)
-    beside = Beside(part.of(photograph.rgb), order.query.maps or MAPS)
+    origin = _origin_of(order, estimator.manifest.name, depth_map.camera, warnings)
+    beside = Beside(part.of(photograph.rgb), order.query.maps or MAPS, origin)
     with stopwatch.stage("encode"):
         encoded = tuple(
             _as_json(depth_map, order, part, estimator.manifest.name, warnings)
@@ -105,6 +106,20 @@ def _as_json(depth_map: DepthMap, order: Order, part: Part, model: str, warnings
         warnings=list(warnings),
     )
     return Encoded(read.model_dump_json().encode(), FORMAT_TYPES[JSON])
+
+
+def _origin_of(order: Order, model: str, used: Camera, warnings: Sequence[str]) -> dict[str, object]:
+    """What makes an answer what it is, but for the photograph; ``used`` is the camera it is by."""
+    return {
+        "camera": order.record.name,
+        "revision": order.record.revision,
+        "model": model,
+        "side": order.query.side,
+        "focus_distance_m": used.focus_distance_m,
+        "roi": order.query.roi,
+        "known": order.query.known,
+        "warnings": warnings,
+    }
 
 
 def _focused(camera: Camera, focus_distance_m: float | None) -> tuple[Camera, tuple[str, ...]]:

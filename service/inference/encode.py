@@ -4,9 +4,11 @@ Units and the sign for no answer are those of ROS REP 118: float metres with NaN
 """
 
 import io
+import json
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -29,6 +31,8 @@ SAMPLES = 2**16
 UNDISTORTING = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-6)
 LENS_CELL_PX, MOST_OFF_PX = 8, 0.5
 PERCENTILES = (0, 5, 50, 95, 100)
+GDAL_NODATA = (42113, "s", 0, "nan", True)  # the tag by which GDAL knows what is no answer
+COMMENT_LETTERS = 200  # what reads PLY takes lines of 1,000 or so
 MapName = Literal["depth_m", "depth_alt_m", "p_near", "sigma_m", "blur_px", "valid"]
 MAPS: tuple[MapName, ...] = get_args(MapName)
 MEDIA_TYPES: dict[str, str] = {
@@ -53,10 +57,18 @@ class Encoded:
 
 @dataclass(frozen=True, slots=True)
 class Beside:
-    """What goes into files beside depth: the photograph's colours [h, w, 3] into points, these maps into an npz."""
+    """What goes into files beside depth: the photograph's colours [h, w, 3] into points, these maps into an npz.
+
+    ``origin`` is what the answer was made by, for files that have room to say so.
+    """
 
     rgb: NDArray[np.uint8]
     maps: Sequence[MapName] = MAPS
+    origin: Mapping[str, object] = field(default_factory=dict)
+
+    def told(self, depth_scale_m: float = 1.0) -> dict[str, object]:
+        """The origin, with the metres per unit of a file."""
+        return {**self.origin, "depth_scale_m": depth_scale_m}
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +94,7 @@ class Spread:
     max: float | None
 
 
-def encode_png(answer: DepthMap, _: Beside) -> Encoded:
+def encode_png(answer: DepthMap, beside: Beside) -> Encoded:
     """16-bit grey, millimetres along z; 0 is no answer, which includes what lies beyond 65.535 m."""
     size = answer.height_px, answer.width_px
     levels, beyond = np.empty(size, np.uint16), 0
@@ -92,7 +104,7 @@ def encode_png(answer: DepthMap, _: Beside) -> Encoded:
         beyond += int(np.count_nonzero(too_far))
         millimetres[too_far | ~answer.valid[rows]] = 0
         levels[rows] = millimetres
-    body = grey_png(levels)
+    body = grey_png(levels, json.dumps(beside.told(MILLIMETRE)))
     lost = f"{beyond / levels.size:.1%} of the pixels lie beyond the 65.535 m a 16-bit PNG can hold and read 0"
     warnings = (lost,) if beyond else _coarse(levels)
     return Encoded(body, MEDIA_TYPES["png"], MILLIMETRE, warnings)
@@ -121,22 +133,34 @@ def encode_npy(answer: DepthMap, _: Beside) -> Encoded:
 
 
 def encode_npz(answer: DepthMap, beside: Beside) -> Encoded:
-    """Maps by their names, ``K`` float64 [3, 3], NaN and a warning if unknown, ``distortion`` if there is any."""
+    """Maps by their names, ``K`` float64 [3, 3], NaN and a warning if unknown, ``distortion`` if there is any.
+
+    ``origin`` is JSON, as bytes: many programs read no other arrays than of numbers.
+    """
     distortion = _distortion(answer)
     matrix = camera_matrix(answer)
     unknown = () if np.isfinite(matrix).all() else ("the camera has no focal length in pixels: K is NaN",)
     arrays: dict[str, Any] = {name: getattr(answer, name) for name in beside.maps} | {"K": matrix}
     if distortion.any():
         arrays["distortion"] = distortion
+    arrays["origin"] = np.frombuffer(json.dumps(beside.told()).encode(), np.uint8)
     stream = io.BytesIO()
     np.savez(stream, **arrays)
     return Encoded(stream.getvalue(), MEDIA_TYPES["npz"], warnings=unknown)
 
 
-def encode_tiff(answer: DepthMap, _: Beside) -> Encoded:
+def encode_tiff(answer: DepthMap, beside: Beside) -> Encoded:
     """float32 metres, one page, uncompressed; NaN where there is no answer."""
     stream = io.BytesIO()
-    tifffile.imwrite(stream, answer.depth_m, photometric="minisblack")
+    tifffile.imwrite(
+        stream,
+        answer.depth_m,
+        photometric="minisblack",
+        description=json.dumps(beside.told()),
+        metadata=None,
+        software="camind",
+        extratags=(GDAL_NODATA,),
+    )
     return Encoded(stream.getvalue(), MEDIA_TYPES["tiff"])
 
 
@@ -162,7 +186,8 @@ def encode_ply(answer: DepthMap, beside: Beside) -> Encoded:
     lost = (
         f"{1 - is_met.mean():.1%} of the points are left out: by the camera's distortion no ray meets the sensor there"
     )
-    return Encoded(_ply_header(len(z)) + points.tobytes(), MEDIA_TYPES["ply"], warnings=() if is_met.all() else (lost,))
+    body = _ply_header(len(z), beside) + points.tobytes()
+    return Encoded(body, MEDIA_TYPES["ply"], warnings=() if is_met.all() else (lost,))
 
 
 def encode_preview(answer: DepthMap, _: Beside) -> Encoded:
@@ -274,13 +299,16 @@ def _number_or_none(value: np.float32) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _ply_header(count: int) -> bytes:
+def _ply_header(count: int, beside: Beside) -> bytes:
+    told = (f"{name}: {json.dumps(value)}" for name, value in beside.told().items())
+    comments = (f"comment {line}" for text in told for line in textwrap.wrap(text, COMMENT_LETTERS))
     fields = [f"property float {axis}" for axis in "xyz"]
     fields += [f"property uchar {colour}" for colour in ("red", "green", "blue")]
     lines = [
         "ply",
         "format binary_little_endian 1.0",
         "comment metres, x right, y down, z forward",
+        *comments,
         f"element vertex {count}",
     ]
     return "\n".join([*lines, *fields, "end_header", ""]).encode("ascii")

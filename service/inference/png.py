@@ -13,8 +13,8 @@ UP = 2
 FAST = 1
 
 
-def grey_png(levels: NDArray[np.uint16]) -> bytes:
-    """The file of levels [h, w], each row as its difference to the one above."""
+def grey_png(levels: NDArray[np.uint16], description: str = "") -> bytes:
+    """The file of levels [h, w], each row as its difference to the one above, and a description in Latin-1."""
     height, width = levels.shape
     octets = levels.astype(">u2").view(np.uint8)
     rows = np.empty((height, 1 + 2 * width), np.uint8)
@@ -23,7 +23,9 @@ def grey_png(levels: NDArray[np.uint16]) -> bytes:
     np.subtract(octets[1:], octets[:-1], out=rows[1:, 1:])
     header = struct.pack(">IIBBBBB", width, height, BITS, GREY, PLAIN, PLAIN, PLAIN)
     deflated = isal_zlib.compress(rows.data, FAST)
-    return SIGNATURE + _chunk(b"IHDR", header) + _chunk(b"IDAT", deflated) + _chunk(b"IEND", b"")
+    text = b"Description\0" + description.encode("latin-1")
+    chunks = ((b"IHDR", header), (b"tEXt", text), (b"IDAT", deflated), (b"IEND", b""))
+    return SIGNATURE + b"".join(_chunk(kind, content) for kind, content in chunks)
 
 
 def _chunk(kind: bytes, content: bytes) -> bytes:

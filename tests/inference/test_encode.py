@@ -1,6 +1,7 @@
 """Every form of the answer is read back to the numbers it was made of."""
 
 import io
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -101,7 +102,7 @@ def test_npy_and_tiff_hold_the_very_floats(answer: DepthMap) -> None:
 
 def test_npz_holds_all_maps_and_the_camera_matrix(answer: DepthMap) -> None:
     with np.load(io.BytesIO(encode_npz(answer, BESIDE).body), allow_pickle=False) as stored:
-        assert set(stored) == {"depth_m", "depth_alt_m", "p_near", "sigma_m", "blur_px", "valid", "K"}
+        assert set(stored) == {"depth_m", "depth_alt_m", "p_near", "sigma_m", "blur_px", "valid", "K", "origin"}
         np.testing.assert_array_equal(stored["depth_alt_m"], answer.depth_alt_m)
         np.testing.assert_array_equal(stored["valid"], answer.valid)
         np.testing.assert_array_equal(stored["K"], [[50, 0, 19.5], [0, 52, 14.5], [0, 0, 1]])
@@ -114,8 +115,28 @@ def test_an_npz_holds_the_maps_that_are_asked_for_and_the_camera_matrix(answer: 
     unread = replace(answer, layers=never)
     body = encode_npz(unread, Beside(RGB, ("valid", "depth_m", "depth_m"))).body
     with np.load(io.BytesIO(body)) as stored:
-        assert set(stored) == {"depth_m", "valid", "K"}
+        assert set(stored) == {"depth_m", "valid", "K", "origin"}
         np.testing.assert_array_equal(stored["depth_m"], answer.depth_m)
+
+
+def test_files_say_what_they_were_made_by_and_in_which_unit(answer: DepthMap) -> None:
+    origin = {"camera": "bench", "revision": 3, "warnings": ["40 m, \xe9"] * 100}
+    beside = Beside(RGB, origin=origin)
+    in_metres, in_millimetres = {**origin, "depth_scale_m": 1.0}, {**origin, "depth_scale_m": 0.001}
+    text = encode_png(answer, beside).body.partition(b"tEXtDescription\0")[2].decode("latin-1")
+    assert json.JSONDecoder().raw_decode(text)[0] == in_millimetres
+    with tifffile.TiffFile(io.BytesIO(encode_tiff(answer, beside).body)) as tiff:
+        assert json.loads(tiff.pages.first.description) == in_metres
+    with np.load(io.BytesIO(encode_npz(answer, beside).body)) as stored:
+        assert json.loads(stored["origin"].tobytes()) == in_metres
+    comments = encode_ply(answer, beside).body.partition(b"element")[0].decode("ascii").splitlines()[2:]
+    assert {'comment camera: "bench"', "comment revision: 3", "comment depth_scale_m: 1.0"} <= set(comments)
+    assert all(line.startswith("comment ") and len(line) < 256 for line in comments)
+
+
+def test_gdal_is_told_that_nan_is_no_answer_in_a_tiff(answer: DepthMap) -> None:
+    with tifffile.TiffFile(io.BytesIO(encode_tiff(answer, BESIDE).body)) as tiff:
+        assert tiff.pages.first.tags["GDAL_NODATA"].value == "nan"
 
 
 def test_unknown_intrinsics_are_nan_in_npz_and_no_point_cloud(answer: DepthMap) -> None:
