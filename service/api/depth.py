@@ -1,5 +1,7 @@
 """``POST /depth``: one photograph in, metres out."""
 
+from collections.abc import Sequence
+from itertools import accumulate
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
@@ -26,6 +28,7 @@ from service.inference.encode import MEDIA_TYPES
 from service.inference.images import ImageLimits
 from service.tracing import STAGES_KEY
 
+MOST_LETTERS = 2_000  # of warnings in a header: nginx takes 4 kB for all of them, or answers 502
 STAGES = ("decode", "wait", "blur", "correct", "depth", "encode")
 
 router = APIRouter(tags=["depth"])
@@ -51,7 +54,7 @@ router = APIRouter(tags=["depth"])
                     "Camind-Model": "The model's name",
                     "Camind-Focus-Distance-M": "The focus distance used, in metres",
                     "Camind-Depth-Scale-M": "Metres per unit of the map: 0.001 for png, else 1",
-                    "Camind-Warnings": "What to know about this answer, separated by semicolons",
+                    "Camind-Warnings": "What to know about this answer, separated by semicolons; json has all of many",
                     "Server-Timing": f"Milliseconds of {', '.join(STAGES)}",
                 }.items()
             },
@@ -101,12 +104,17 @@ async def estimate_depth(
             "Camind-Model": estimator.manifest.name,
             "Camind-Focus-Distance-M": f"{answer.camera.focus_distance_m:.6g}",
             "Camind-Depth-Scale-M": f"{encoded.depth_scale_m:g}",
-            "Camind-Warnings": _header_safe("; ".join(answer.warnings)),
+            "Camind-Warnings": _in_a_header(answer.warnings),
             "Server-Timing": ", ".join(f"{stage};dur={timings_ms[stage]:.1f}" for stage in STAGES),
             "Vary": "Accept",
         },
     )
 
 
-def _header_safe(text: str) -> str:
+def _in_a_header(warnings: Sequence[str]) -> str:
+    """As many as there is room for, in the letters that a header may have."""
+    ends = accumulate(len(warning) + len("; ") for warning in warnings)
+    told = [warning for warning, end in zip(warnings, ends, strict=True) if end <= MOST_LETTERS]
+    more = len(warnings) - len(told)
+    text = "; ".join([*told, f"and {more} more, which format=json has"] if more else told)
     return "".join(letter if " " <= letter <= "~" else "?" for letter in text)

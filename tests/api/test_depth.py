@@ -301,6 +301,16 @@ def test_known_depths_tell_where_this_shot_was_focused(bench: TestClient) -> Non
     assert npy(response)[20, 20] == pytest.approx(1.1, rel=0.005)
 
 
+def test_so_many_warnings_that_no_proxy_takes_them_in_a_header_are_in_json(bench: TestClient) -> None:
+    known = [f"{pixel % 96},{pixel // 2},{0.4 + pixel % 7}" for pixel in range(100)]
+    response = ask(bench, format="json", known=known)
+    every = response.json()["warnings"]
+    *told, more = response.headers["Camind-Warnings"].split("; ")
+    assert len(response.headers["Camind-Warnings"]) < 2_100
+    assert told == every[: len(told)]
+    assert more == f"and {len(every) - len(told)} more, which format=json has"
+
+
 def test_known_depths_are_of_the_whole_whatever_part_is_asked_for(bench: TestClient) -> None:
     whole, part = (ask(bench, format="npy", known="90,60,1.1", roi=roi) for roi in (None, "0,0,32,32"))
     np.testing.assert_allclose(npy(part), npy(whole)[:32, :32], rtol=1e-4)
