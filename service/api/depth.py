@@ -85,7 +85,7 @@ async def estimate_depth(
     The photograph must be the camera's whole frame, at any size; a part of the map alone is `roi`. Without an answer a
     pixel is NaN, in png 0.
     """
-    chosen = choose_format(query.format, request.headers.get("accept"), FORMAT_TYPES)
+    chosen = choose_format(query.format, ", ".join(request.headers.getlist("accept")), FORMAT_TYPES)
     upload = await receive_photograph(request)
     record = await run_in_threadpool(cameras.get, query.camera)
     order = Order.of(upload, record, query, (chosen,), ImageLimits.of(settings))

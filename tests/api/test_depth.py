@@ -187,6 +187,12 @@ def test_accept_chooses_the_form(bench: TestClient, accept: str, kind: str) -> N
     assert "Accept" in response.headers["vary"]
 
 
+def test_accept_may_come_in_several_lines(bench: TestClient) -> None:
+    lines = [("Content-Type", "image/png"), ("Accept", "image/webp"), ("Accept", "image/tiff")]
+    response = bench.post("/depth", params={"camera": "bench"}, content=png(grey()), headers=lines)
+    assert (response.status_code, response.headers["content-type"]) == (200, "image/tiff")
+
+
 def test_format_wins_over_accept(bench: TestClient) -> None:
     response = ask(bench, headers={"Accept": "image/png"}, format="json")
     assert response.headers["content-type"] == "application/json"
