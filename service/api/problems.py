@@ -130,7 +130,7 @@ EXAMPLES: dict[str, tuple[str, tuple[FieldProblem, ...]]] = {
     "quota-exceeded": ("This API key has had its 600 requests of this minute.", ()),
     "not-found": ("There is no camera 'd200': register it with POST /cameras.", ()),
     "conflict": (TAKEN, (FieldProblem("#/name", TAKEN),)),
-    "precondition-failed": ("Camera 'd200' is at revision 3: read it again, then repeat.", ()),
+    "precondition-failed": ("Camera 'd200' is at revision 3: read it again, then repeat with If-Match: \"3\".", ()),
     "too-large": ("The request body may have at most 40000000 bytes.", ()),
     "unsupported-kind": ("Send JSON with the header Content-Type: application/json, not text/plain.", ()),
     "not-acceptable": (

@@ -212,7 +212,8 @@ def _require_row(session: Session, owner: str, name: str, expected: Sequence[int
     """The row, locked until the end of the transaction, at one of the expected revisions."""
     row = _live(_find_row(session, owner, name, lock=True), name)
     if expected is not None and row.revision not in expected:
-        raise PreconditionFailed(f"Camera '{name}' is at revision {row.revision}: read it again, then repeat.")
+        remedy = f'read it again, then repeat with If-Match: "{row.revision}"'
+        raise PreconditionFailed(f"Camera '{name}' is at revision {row.revision}: {remedy}.")
     return row
 
 

@@ -115,6 +115,7 @@ def test_if_match_holds_back_what_knows_another_revision(
     body = d200 if method == "PUT" else None
     answer = client.request(method, "/cameras/d200", headers={"If-Match": tag}, json=body)
     assert answer.status_code == 412
+    assert answer.json()["detail"].endswith('repeat with If-Match: "1".')
     assert client.get("/cameras/d200").json()["revision"] == 1
 
 
