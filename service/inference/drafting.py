@@ -12,10 +12,9 @@ from functools import lru_cache
 
 import lensfunpy
 
-from service.inference.exif import Exif
+from service.inference.exif import FULL_FRAME_DIAGONAL_MM, Exif
 from service.inference.frame import MOST_ZOOM
 
-FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
 SENSOR_WIDTHS_MM = (1.0, 70.0)
 FOCUS_DISTANCES_M = (0.001, 100_000.0)
 # of the long side to the short one; others are cut out of one of these

@@ -14,6 +14,7 @@ SUBJECT_DISTANCE, FOCAL_LENGTH_35MM, LENS_MODEL = 0x9206, 0xA405, 0xA434
 WIDTH, HEIGHT, PLANE_RESOLUTION, PLANE_UNIT = 0xA002, 0xA003, 0xA20E, 0xA210
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 MOST_TEXT = 64
+FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)  # of what a 35-mm equivalent is seen on
 INFINITY = 2**32 - 1  # all ones, in a distance
 # what phones write beyond the standard's 0 and 1
 RENDERINGS = {6: "a panorama", 7: "a portrait mode", 8: "a portrait mode"}

@@ -1,9 +1,10 @@
 """Whether a photograph is a camera's frame, and the camera as that photograph has it."""
 
+import math
 from collections.abc import Iterator
 
 from service.errors import ImageSizeMismatch
-from service.inference.exif import Exif
+from service.inference.exif import FULL_FRAME_DIAGONAL_MM, Exif
 from service.inference.images import TURNS, UNTURNS, Photograph
 from service.optics import thin_lens
 from service.optics.camera import Camera, Lens
@@ -12,6 +13,7 @@ LENS_TOLERANCE = 0.05
 FOCUS_TOLERANCE = 0.15
 VIEW_TOLERANCE = 1.05
 MOST_ZOOM = 1.01
+SAME_VIEW = 1.25  # equivalents are rounded, and count the whole of a sensor that 16:9 or a square is cut out of
 
 
 def stored_camera_of(camera: Camera, width_px: int, height_px: int, orientation: int) -> Camera | None:
@@ -86,6 +88,28 @@ def _other_focus(exif: Exif, focus_distance_m: float) -> Iterator[str]:
         yield (
             f"its EXIF says that it was focused at {noted[0]:.4g} m, the camera at {focus_distance_m:.4g} m: "
             "send this shot's focus_distance_m"
+        )
+
+
+def maybe_another_part(exif: Exif, camera: Camera) -> Iterator[str]:
+    """A warning where the EXIF tells, by no zoom but by its 35-mm equivalent, of another field of view.
+
+    ``camera`` has the photograph's size. That a lens focused close may see less is allowed for, and of another focal
+    length than the lens' ``taken_otherwise`` tells.
+    """
+    equivalent_mm, focal_length_m = exif.focal_length_35mm, (exif.focal_length_mm or math.inf) / 1e3
+    if equivalent_mm is None or camera.intrinsics is None or (exif.digital_zoom or 1.0) > MOST_ZOOM:
+        return
+    is_other_lens = abs(focal_length_m / (camera.focal_length_m or focal_length_m) - 1) > LENS_TOLERANCE
+    if is_other_lens or focal_length_m >= camera.focus_distance_m:
+        return
+    diagonal_px = math.hypot(camera.image_width_px, camera.image_height_px)
+    camera_mm = camera.intrinsics.fx_px / diagonal_px * FULL_FRAME_DIAGONAL_MM
+    longer = thin_lens.image_distance_in_focal_lengths(camera.focus_distance_m, focal_length_m)
+    if not 1 / SAME_VIEW <= camera_mm / equivalent_mm <= SAME_VIEW * longer:
+        yield (
+            f"its EXIF says it shows what {equivalent_mm:g} mm show on 35-mm film, the camera what {camera_mm:.3g} do: "
+            "another lens or part of the sensor (a phone's 2x, a crop mode) is another camera, drafted from its picture"
         )
 
 

@@ -294,6 +294,9 @@ def test_a_photograph_by_another_lens_is_warned_of(client: TestClient, d200: dic
     warned = ask(client, other, {"Content-Type": "image/jpeg"}, camera="d200").headers["Camind-Warnings"]
     assert warned == "its EXIF says 50 mm f/1.2, the camera is 35 mm f/2.8"
     assert "EXIF" not in ask(client, other).headers["Camind-Warnings"]
+    cropped = with_exif(jpeg(grey(60, 432, 645)), exif_of({}, {0x920A: (35, 1), 0xA405: 105}))
+    warned = ask(client, cropped, {"Content-Type": "image/jpeg"}, camera="d200").headers["Camind-Warnings"]
+    assert warned.startswith("its EXIF says it shows what 105 mm show on 35-mm film, the camera what 53.7 do")
 
 
 def test_known_depths_tell_where_this_shot_was_focused(bench: TestClient) -> None:

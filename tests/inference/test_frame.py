@@ -1,12 +1,15 @@
 """The camera follows its photograph: turned, resized, or refused."""
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from service.errors import ImageSizeMismatch
 from service.inference.exif import Exif
-from service.inference.frame import camera_of, maybe_seen_narrower, taken_otherwise
+from service.inference.frame import camera_of, maybe_another_part, maybe_seen_narrower, taken_otherwise
 from service.inference.images import TURNS, Photograph, turned
 from service.opencv import cv2
 from service.optics import thin_lens
@@ -96,6 +99,39 @@ def test_a_digital_zoom_is_told_of_whatever_the_camera_was_made_from() -> None:
     (warning,) = taken_otherwise(Exif(digital_zoom=2.0), None, None)
     assert "digital zoom of 2" in warning
     assert not [*taken_otherwise(Exif(digital_zoom=1.0), None, None)]
+
+
+@pytest.mark.parametrize(
+    ("size_px", "equivalent_mm", "tags", "is_another"),
+    [
+        ((5712, 4284), 24, {}, False),
+        ((5712, 3213), 24, {}, False),
+        ((4284, 4284), 24, {}, False),
+        ((5712, 4284), 48, {}, True),
+        ((5712, 4284), 12, {}, True),
+        ((5712, 4284), 48, {"digital_zoom": 2.0}, False),
+        ((5712, 4284), 120, {"focal_length_mm": 15.7}, False),
+        ((5712, 4284), 24, {"focal_length_mm": None}, False),
+        ((5712, 4284), None, {}, False),
+    ],
+    ids=["whole", "16:9", "square", "2x", "whole, by a 2x", "zoom that is told", "other lens", "no lens", "no word"],
+)
+def test_a_part_of_the_sensor_that_no_zoom_tells_of_is_known_by_its_field_of_view(
+    size_px: tuple[int, int], equivalent_mm: float | None, tags: dict[str, Any], *, is_another: bool
+) -> None:
+    seen = Intrinsics.centred(3961.0, *size_px)
+    camera = Camera(*size_px, 0.5, 3.8, focal_length_m=0.006765, intrinsics=seen)
+    exif = replace(Exif(focal_length_mm=6.765, focal_length_35mm=equivalent_mm), **tags)
+    for one in (camera, camera.resized(size_px[0] // 2, size_px[1] // 2)):
+        assert len([*maybe_another_part(exif, one)]) == is_another
+    assert not [*maybe_another_part(exif, replace(camera, intrinsics=None))]
+
+
+def test_a_lens_focused_close_may_see_less_than_its_equivalent_tells() -> None:
+    macro = Exif(focal_length_mm=100.0, focal_length_35mm=100.0)
+    at_half_size = Camera(6000, 4000, 0.3, 300.0, intrinsics=Intrinsics.centred(25_000.0, 6000, 4000))
+    assert not [*maybe_another_part(macro, at_half_size)]
+    assert [*maybe_another_part(macro, replace(at_half_size, focus_distance_m=5.0))]
 
 
 def test_a_portrait_mode_is_told_of() -> None:
