@@ -13,17 +13,19 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from service.errors import InvalidImage, UnsupportedKind
-from service.inference.heic import exif_item, primary_picture
+from service.inference.heic import curve_of_primary, exif_item, primary_picture
+from service.inference.tone_curve import CURVES, SRGB, curve_of_profile, unpacked_profile
 
 Kind = Literal["jpeg", "png", "tiff", "webp", "heic", "raw"]
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-PNG_READ = frozenset({b"IHDR", b"eXIf", b"acTL"})
+PNG_READ = frozenset({b"IHDR", b"eXIf", b"acTL", b"cICP", b"iCCP"})
 EXIF_SIGNATURE = b"Exif\x00\x00"
+ICC_SIGNATURE, ICC_NUMBERING = b"ICC_PROFILE\x00", 2
 HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"mif1"})
 JPEG_MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
 JPEG_FILL = re.compile(rb"\xff*(?=\xff)")
-JPEG_END, JPEG_SCAN, JPEG_APP1 = 0xD9, 0xDA, 0xE1
+JPEG_END, JPEG_SCAN, JPEG_APP1, JPEG_APP2 = 0xD9, 0xDA, 0xE1, 0xE2
 JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 JPEG_BARE = frozenset({0x01, 0xD8, *range(0xD0, 0xD8)})
 TIFF_WIDTH, TIFF_HEIGHT, TIFF_BITS, TIFF_ORIENTATION, TIFF_SAMPLE_FORMAT = 256, 257, 258, 274, 339
@@ -39,7 +41,7 @@ TIFF_TYPES = {1: "B", 3: "H", 4: "I", 13: "I"}
 # with those that are no whole numbers: a rational is two
 TIFF_NUMBERS = {**TIFF_TYPES, 5: "II", 11: "f", 12: "d"}
 TIFF_TEXT, TIFF_MOST_TEXT = 2, 256
-EXIF_DIRECTORY = 34665
+EXIF_DIRECTORY, TIFF_PROFILE = 34665, 34675
 TIFF_MAX_VALUES = 100_000
 TIFF_MAX_ENTRIES = 4_096
 TIFF_TILE_SIZE = (322, 323)
@@ -53,7 +55,8 @@ MOST_SCANS = 64
 class Header:
     """Stored size in pixels, before orientation (EXIF, 1..8) is applied; ``exif`` is the EXIF, without a signature.
 
-    Of a tiff or raw file that is the file. ``has_more``: other pages or frames follow.
+    Of a tiff or raw file that is the file. ``has_more``: other pages or frames follow. ``curve``: what its values have,
+    by H.273's number.
     """
 
     kind: Kind
@@ -63,6 +66,12 @@ class Header:
     orientation_offset: int | None = None
     exif: bytes = b""
     has_more: bool = False
+    curve: int = SRGB
+
+    @property
+    def other_curve(self) -> str | None:
+        """The name of a curve that is far from sRGB; None where it is about that, as of nearly all photographs."""
+        return CURVES.get(self.curve)
 
 
 def sniff(data: bytes) -> Kind | None:
@@ -107,7 +116,7 @@ def _too_many_parts(kind: str) -> InvalidImage:
 
 def _jpeg(data: bytes) -> Header:
     size: tuple[int, int] | None = None
-    exif = b""
+    exif = profile = b""
     scans = 0
     for marker, payload in _jpeg_segments(data):
         scans += marker == JPEG_SCAN
@@ -118,9 +127,11 @@ def _jpeg(data: bytes) -> Header:
             size = (width, height)
         elif marker == JPEG_APP1 and payload.startswith(EXIF_SIGNATURE):
             exif = payload[len(EXIF_SIGNATURE) :]
+        elif marker == JPEG_APP2 and payload.startswith(ICC_SIGNATURE):
+            profile = profile or payload[len(ICC_SIGNATURE) + ICC_NUMBERING :]
     if size is None:
         raise InvalidImage("The jpeg file holds no picture.")
-    return Header("jpeg", *size, _exif_orientation(exif), exif=exif)
+    return Header("jpeg", *size, _exif_orientation(exif), exif=exif, curve=curve_of_profile(profile))
 
 
 def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
@@ -149,7 +160,7 @@ def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 def _png(data: bytes) -> Header:
     size, frames = (0, 0), 1
-    exif = b""
+    exif = profile = coded = b""
     for name, payload in _png_chunks(data):
         if name == b"IHDR":
             size = struct.unpack_from(">II", payload)
@@ -157,7 +168,12 @@ def _png(data: bytes) -> Header:
             exif = payload
         elif name == b"acTL":
             frames = int.from_bytes(payload[:4], "big")
-    return Header("png", *size, _exif_orientation(exif), exif=exif, has_more=frames > 1)
+        elif name == b"iCCP":
+            profile = payload
+        elif name == b"cICP":
+            coded = payload[1:2]
+    curve = int.from_bytes(coded, "big") if coded else curve_of_profile(unpacked_profile(profile))
+    return Header("png", *size, _exif_orientation(exif), exif=exif, has_more=frames > 1, curve=curve)
 
 
 def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
@@ -181,7 +197,7 @@ def _webp(data: bytes) -> Header:
     if length + 8 > len(data):
         raise cut_off("webp")
     size: tuple[int, int] | None = None
-    exif = b""
+    exif = profile = b""
     frames = 0
     at = 12
     for _ in range(MOST_PARTS):
@@ -192,12 +208,15 @@ def _webp(data: bytes) -> Header:
         frames += name == b"ANMF"
         if name == b"EXIF":
             exif = data[at + 8 : at + 8 + chunk].removeprefix(EXIF_SIGNATURE)
+        elif name == b"ICCP":
+            profile = data[at + 8 : at + 8 + chunk]
         at += 8 + chunk + chunk % 2
     else:
         raise _too_many_parts("webp")
     if size is None:
         raise InvalidImage("The webp file holds no picture.")
-    return Header("webp", *size, _exif_orientation(exif), exif=exif, has_more=frames > 1)
+    curve = curve_of_profile(profile)
+    return Header("webp", *size, _exif_orientation(exif), exif=exif, has_more=frames > 1, curve=curve)
 
 
 def _webp_size(name: bytes, payload: bytes) -> tuple[int, int] | None:
@@ -225,7 +244,8 @@ def _tiff(data: bytes) -> Header:
     _require_usual(directory)
     _require_tiles(directory)
     at = directory.offset_of(TIFF_ORIENTATION)
-    return Header("tiff", *directory.size, directory.orientation(), at, data, _has_more_pages(data, directory))
+    has_more, curve = _has_more_pages(data, directory), curve_of_profile(directory.bytes_of(TIFF_PROFILE))
+    return Header("tiff", *directory.size, directory.orientation(), at, data, has_more, curve)
 
 
 def _require_usual(directory: "TiffDirectory") -> None:
@@ -268,7 +288,7 @@ def _sensor_size(data: bytes, first: "TiffDirectory") -> tuple[int, int] | None:
 
 
 def _heic(data: bytes) -> Header:
-    return Header("heic", *primary_picture(data), exif=exif_item(data))
+    return Header("heic", *primary_picture(data), exif=exif_item(data), curve=curve_of_primary(data))
 
 
 def _exif_orientation(data: bytes) -> int:
@@ -352,6 +372,11 @@ class TiffDirectory:
         if count > TIFF_MAX_VALUES:
             raise InvalidImage(f"The tiff file states {count} values for tag {tag}.")
         return self._unpack(f"{count}{TIFF_TYPES[kind]}", at)
+
+    def bytes_of(self, tag: int) -> bytes:
+        """A tag's bytes, from where they begin; empty without the tag."""
+        at = self.offset_of(tag)
+        return b"" if at is None else self._data[at : at + self._unpack("I", self._entries[tag] + 4)[0]]
 
     def number(self, tag: int) -> float | None:
         """A tag's first number, of any type; None without one that is positive and finite."""

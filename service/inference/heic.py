@@ -1,4 +1,4 @@
-"""What a HEIC's boxes say of its primary picture: the size and the turn that its decoder applies; and its EXIF."""
+"""What a HEIC's boxes say of its primary picture: the size, curve and the turn its decoder applies; and its EXIF."""
 
 import struct
 from collections.abc import Iterator
@@ -6,6 +6,7 @@ from io import BytesIO
 from itertools import islice
 
 from service.errors import InvalidImage
+from service.inference.tone_curve import CURVES, MOST_PROFILE_BYTES, SRGB, curve_of_profile
 
 MOST_BOXES = 20_000
 MOST_LISTS = 8
@@ -30,19 +31,8 @@ def primary_picture(data: bytes) -> tuple[int, int, int]:
 
     Raises ``InvalidImage``, and ``IndexError`` or ``struct.error`` where the bytes end inside a box.
     """
-    top = {name: (start, end) for name, start, end in _boxes(data, 0, len(data))}
-    if b"meta" not in top:
-        raise InvalidImage("The heic file holds no picture.")
-    start, end = top[b"meta"]
-    inner = {name: (start, end) for name, start, end in _boxes(data, start + 4, end)}
-    if not {b"pitm", b"iprp"} <= inner.keys():
-        raise InvalidImage("The heic file holds no picture.")
-    if b"mdat" not in top and b"idat" not in inner:
-        raise _cut_off()
-    at = inner[b"pitm"][0]
-    primary = int.from_bytes(data[at + 4 : at + (8 if data[at] else 6)], "big")
     width, height, corners = 0, 0, (0, 1, 2, 3)
-    for name, at in _properties(data, *inner[b"iprp"], primary):
+    for name, at in _primary_properties(data):
         if name == b"ispe":
             width, height = struct.unpack_from(">II", data, at + 4)
         elif name == b"clap":
@@ -55,6 +45,12 @@ def primary_picture(data: bytes) -> tuple[int, int, int]:
             corners = _moved(corners, LEFT_TO_RIGHT if data[at] & 1 else TOP_TO_BOTTOM)
     orientation = ORIENTATIONS[corners]
     return (height, width, orientation) if orientation >= 5 else (width, height, orientation)
+
+
+def curve_of_primary(data: bytes) -> int:
+    """The number in H.273 of the curve that the primary picture's values have; raises as ``primary_picture`` does."""
+    told = (_curve(data, at) for name, at in _primary_properties(data) if name == b"colr")
+    return next((curve for curve in told if curve in CURVES), SRGB)
 
 
 def exif_item(data: bytes) -> bytes:
@@ -106,12 +102,35 @@ def _place(data: bytes, at: int, item: int) -> tuple[int, int]:
     raise LookupError(item)
 
 
+def _curve(data: bytes, at: int) -> int:
+    """What a ``colr`` property says, by a number or by a profile, which ends with its box."""
+    if data[at : at + 4] == b"nclx":
+        return int.from_bytes(data[at + 6 : at + 8], "big")
+    (size,) = struct.unpack_from(">I", data, at - 8)
+    return curve_of_profile(data[at + 4 : at - 8 + min(size, MOST_PROFILE_BYTES)])
+
+
 def _cut_off() -> InvalidImage:
     return InvalidImage("The heic file is cut off: it ends before the picture does.")
 
 
 def _moved(corners: Corners, order: Corners) -> Corners:
     return corners[order[0]], corners[order[1]], corners[order[2]], corners[order[3]]
+
+
+def _primary_properties(data: bytes) -> Iterator[tuple[bytes, int]]:
+    top = {name: (start, end) for name, start, end in _boxes(data, 0, len(data))}
+    if b"meta" not in top:
+        raise InvalidImage("The heic file holds no picture.")
+    start, end = top[b"meta"]
+    inner = {name: (start, end) for name, start, end in _boxes(data, start + 4, end)}
+    if not {b"pitm", b"iprp"} <= inner.keys():
+        raise InvalidImage("The heic file holds no picture.")
+    if b"mdat" not in top and b"idat" not in inner:
+        raise _cut_off()
+    at = inner[b"pitm"][0]
+    primary = int.from_bytes(data[at + 4 : at + (8 if data[at] else 6)], "big")
+    yield from _properties(data, *inner[b"iprp"], primary)
 
 
 def _properties(data: bytes, start: int, end: int, item: int) -> Iterator[tuple[bytes, int]]:

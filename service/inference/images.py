@@ -109,15 +109,20 @@ def read_photograph(data: bytes, media_type: str | None = None, limits: ImageLim
     warnings: tuple[str, ...] = (f"declared {media_type}, read as {kind}",) if declared not in (None, kind) else ()
     if header.has_more:
         warnings += ("the file has more than one picture: the first was read",)
+    if header.other_curve is not None:
+        warnings += (f"its colour profile is {header.other_curve}, and it was read as sRGB: export it as sRGB",)
     return Photograph(turned(stored, orientation), kind, orientation, warnings, read_exif(header.exif))
 
 
 def read_stored_frame(data: bytes, limits: ImageLimits | None = None) -> NDArray[np.uint8]:
     """The pixels [h, w, 3] RGB as the sensor had them, orientation not applied: a lens belongs to its sensor.
 
-    Raises as ``read_photograph`` does.
+    Raises as ``read_photograph`` does, and ``UnsupportedKind`` for light that would be measured by a wrong curve.
     """
-    return _read(data, limits or ImageLimits())[1]
+    header, stored = _read(data, limits or ImageLimits())
+    if header.other_curve is not None:
+        raise UnsupportedKind(f"Its colour profile is {header.other_curve}: export it as sRGB, to be measured.")
+    return stored
 
 
 def turned(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:

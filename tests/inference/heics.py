@@ -35,13 +35,16 @@ def heic(
     stated: tuple[int, int] = (64, 64),
     crop: bytes | None = CROP,
     exif: bytes = b"",
+    colour: bytes = b"",
     version: int = 0,
 ) -> bytes:
     """``corners()``, turned to the left by quarters and then mirrored by whoever decodes it.
 
-    EXIF, if any, is listed in a table of places of that version.
+    EXIF, if any, is listed in a table of places of that version; ``colour`` is the content of a ``colr`` property.
     """
     properties = [box(b"hvcC", HVCC), whole(b"ispe", struct.pack(">II", *stated))]
+    if colour:
+        properties.append(box(b"colr", colour))
     if crop is not None:
         properties.append(box(b"clap", crop))
     if quarters_left is not None:

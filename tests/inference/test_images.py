@@ -3,6 +3,7 @@
 import resource
 import struct
 import time
+import zlib
 from collections.abc import Callable
 from io import BytesIO
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
+from PIL import Image
 
 from service.errors import InvalidImage, TooLarge, UnsupportedKind
 from service.inference.exif import Exif, read_exif
@@ -271,6 +273,56 @@ def test_what_the_lens_was_set_to_is_read_at_once_and_no_damage_stops_it() -> No
     assert time.perf_counter() - started < 0.1
     for length in range(len(exif)):
         read_exif(exif[:length])
+
+
+def icc_profile(**tags: bytes) -> bytes:
+    """An ICC profile of these tags, its head empty."""
+    listed, held = b"", b""
+    for name, content in tags.items():
+        listed += struct.pack(">4sII", name.encode(), 132 + 12 * len(tags) + len(held), len(content))
+        held += content
+    return bytes(128) + struct.pack(">I", len(tags)) + listed + held
+
+
+P3 = icc_profile(rXYZ=bytes(20), rTRC=b"para" + bytes(4) + b"\x00\x03\x00\x00\x00\x02\x66\x66" + bytes(16))
+ADOBE_RGB = icc_profile(rTRC=b"curv" + bytes(4) + b"\x00\x00\x00\x01\x02\x33")
+PROFILES = {
+    "linear light": [
+        icc_profile(rXYZ=bytes(20), rTRC=b"curv" + bytes(8)),
+        icc_profile(rTRC=b"curv" + bytes(4) + b"\x00\x00\x00\x01\x01\x00"),
+        icc_profile(rTRC=b"para" + bytes(8) + b"\x00\x01\x00\x00"),
+        icc_profile(kTRC=b"curv" + bytes(8)),
+    ],
+    "HDR by PQ": [
+        icc_profile(rTRC=b"curv" + bytes(4) + b"\x00\x00\x04\x00", cicp=b"cicp" + bytes(4) + b"\x09\x10\0\1")
+    ],
+    "HDR by HLG": [icc_profile(cicp=b"cicp" + bytes(4) + b"\x09\x12\0\1")],
+    "": [P3, ADOBE_RGB, P3[:140], P3[:100], icc_profile(cicp=b"cicp"), b"x"],
+}
+
+
+@pytest.mark.parametrize("kind", ["jpeg", "png", "tiff", "webp"])
+@pytest.mark.parametrize(("curve", "profile"), [(curve, each) for curve, some in PROFILES.items() for each in some])
+def test_a_profile_far_from_srgb_is_told_of_and_not_measured_by(kind: str, curve: str, profile: bytes) -> None:
+    out = BytesIO()
+    Image.fromarray(corners()).save(out, kind, icc_profile=profile)
+    said = [words for words in read_photograph(out.getvalue()).warnings if f"{curve}, and it was read as sRGB" in words]
+    assert len(said) == bool(curve)
+    if curve:
+        with pytest.raises(UnsupportedKind, match=curve):
+            read_stored_frame(out.getvalue())
+    else:
+        assert read_stored_frame(out.getvalue()).shape == (48, 64, 3)
+
+
+def test_a_png_s_number_of_its_curve_counts_before_its_profile() -> None:
+    for number, curve in ((16, "HDR by PQ"), (18, "HDR by HLG"), (13, None)):
+        coded = png_chunk(b"cICP", bytes([9, number, 0, 1]))
+        profile = png_chunk(b"iCCP", b"x\0\0" + zlib.compress(PROFILES["linear light"][0]))
+        data = png(corners())
+        assert read_header(data[:33] + coded + profile + data[33:]).other_curve == curve
+    for damaged in (b"", b"x", b"x\0\0", b"x\0\0abc"):
+        assert read_header(data[:33] + png_chunk(b"iCCP", damaged) + data[33:]).other_curve is None
 
 
 def pages(*subfiles: int) -> bytes:

@@ -77,6 +77,24 @@ def test_a_heic_is_turned_exactly_once(orientation: int) -> None:
     near(photograph.rgb, turned(corners(), orientation))
 
 
+@pytest.mark.parametrize(
+    ("number", "curve"), [(16, "HDR by PQ"), (18, "HDR by HLG"), (8, "linear light"), (13, ""), (1, ""), (None, "")]
+)
+def test_a_heic_of_high_dynamic_range_is_told_of_and_not_measured_by(number: int | None, curve: str) -> None:
+    data = heic(colour=b"" if number is None else b"nclx" + struct.pack(">HHHB", 9, number, 9, 0x80))
+    assert ([*read_photograph(data).warnings] != []) == bool(curve)
+    if curve:
+        with pytest.raises(UnsupportedKind, match=curve):
+            read_stored_frame(data)
+
+
+def test_a_heic_s_profile_is_read() -> None:
+    linear = bytes(128) + struct.pack(">I4sII", 1, b"rTRC", 144, 12) + b"curv" + bytes(8)
+    for kind in (b"prof", b"rICC"):
+        assert read_header(heic(colour=kind + linear)).other_curve == "linear light"
+    assert read_header(heic(colour=b"prof" + linear[:-1])).other_curve is None
+
+
 def test_the_stored_frame_of_a_heic_is_the_sensor_s() -> None:
     near(read_stored_frame(heic(3)), corners())
 
