@@ -57,6 +57,8 @@ TURNS: dict[int, tuple[bool, bool, bool]] = {
 UNTURNS = {orientation: {6: 8, 8: 6}.get(orientation, orientation) for orientation in TURNS}
 # not IMREAD_COLOR_RGB: OpenCV 5.0 leaves a 16-bit TIFF read so uninitialised
 DECODE_FLAGS = cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+# an industrial camera's 12 bits, in a file of 16 as they are
+MOST_OF_12_BITS, MOST_OF_16_BITS = 4095, 65535
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,9 +106,10 @@ def read_photograph(data: bytes, media_type: str | None = None, limits: ImageLim
     (a declared type or bytes that are not listed).
     """
     declared = declared_kind(media_type)
-    header, stored = _read(data, limits or ImageLimits())
+    header, stored, warnings = _read(data, limits or ImageLimits())
     kind, orientation = header.kind, header.orientation
-    warnings: tuple[str, ...] = (f"declared {media_type}, read as {kind}",) if declared not in (None, kind) else ()
+    if declared not in (None, kind):
+        warnings += (f"declared {media_type}, read as {kind}",)
     if header.has_more:
         warnings += ("the file has more than one picture: the first was read",)
     if header.other_curve is not None:
@@ -119,7 +122,7 @@ def read_stored_frame(data: bytes, limits: ImageLimits | None = None) -> NDArray
 
     Raises as ``read_photograph`` does, and ``UnsupportedKind`` for light that would be measured by a wrong curve.
     """
-    header, stored = _read(data, limits or ImageLimits())
+    header, stored, _ = _read(data, limits or ImageLimits())
     if header.other_curve is not None:
         raise UnsupportedKind(f"Its colour profile is {header.other_curve}: export it as sRGB, to be measured.")
     return stored
@@ -150,19 +153,17 @@ def declared_kind(media_type: str | None) -> Kind | None:
     return kind
 
 
-def _read(data: bytes, limits: ImageLimits) -> tuple[Header, NDArray[np.uint8]]:
+def _read(data: bytes, limits: ImageLimits) -> tuple[Header, NDArray[np.uint8], tuple[str, ...]]:
+    """The header, the stored frame, and warnings of how it was decoded."""
     if len(data) > limits.max_bytes:
         raise TooLarge(f"The file has {len(data)} bytes, more than the {limits.max_bytes} accepted.")
     header = read_header(data)
     _require_size(header.width_px, header.height_px, limits)
-    if header.kind in ("heic", "raw"):
-        stored = decode_isolated(header.kind, data, min(limits.max_pixels, PIXEL_CEILING))
-        _require_size(stored.shape[1], stored.shape[0], limits)
-        if header.kind == "heic":
-            stored = _unturned_pixels(stored, header)
-    else:
-        stored = _decode(data, header)
-    return header, stored
+    if header.kind not in ("heic", "raw"):
+        return header, *_decode(data, header)
+    stored = decode_isolated(header.kind, data, min(limits.max_pixels, PIXEL_CEILING))
+    _require_size(stored.shape[1], stored.shape[0], limits)
+    return header, _unturned_pixels(stored, header) if header.kind == "heic" else stored, ()
 
 
 def _require_size(width_px: int, height_px: int, limits: ImageLimits) -> None:
@@ -173,15 +174,15 @@ def _require_size(width_px: int, height_px: int, limits: ImageLimits) -> None:
         raise TooLarge(f"The picture has {width_px}x{height_px} pixels, more than {limits.max_aspect:g} to 1.")
 
 
-def _decode(data: bytes, header: Header) -> NDArray[np.uint8]:
+def _decode(data: bytes, header: Header) -> tuple[NDArray[np.uint8], tuple[str, ...]]:
     try:
         pixels = cv2.imdecode(np.frombuffer(_unturned(data, header), np.uint8), DECODE_FLAGS)
     except cv2.error as exc:
         raise InvalidImage(f"The {header.kind} file cannot be decoded: it is damaged.") from exc
     if pixels is None or pixels.shape[:2] != (header.height_px, header.width_px):
         raise InvalidImage(f"The {header.kind} file cannot be decoded: it is damaged or of an unusual form.")
-    rgb = cv2.cvtColor(_eight_bits(pixels), cv2.COLOR_BGR2RGB)
-    return np.asarray(rgb, np.uint8)
+    eight_bits, warnings = _eight_bits(pixels)
+    return np.asarray(cv2.cvtColor(eight_bits, cv2.COLOR_BGR2RGB), np.uint8), warnings
 
 
 def _unturned(data: bytes, header: Header) -> bytes:
@@ -194,12 +195,17 @@ def _unturned(data: bytes, header: Header) -> bytes:
     return bytes(stored)
 
 
-def _eight_bits(pixels: NDArray[Any]) -> NDArray[np.uint8]:
+def _eight_bits(pixels: NDArray[Any]) -> tuple[NDArray[np.uint8], tuple[str, ...]]:
+    warnings: tuple[str, ...] = ()
     if pixels.dtype == np.uint16:
-        pixels = cv2.convertScaleAbs(pixels, alpha=1 / 257)
+        most = MOST_OF_16_BITS
+        if 0 < pixels.max() <= MOST_OF_12_BITS:
+            most = MOST_OF_12_BITS
+            warnings = (f"nothing in its 16 bits is above {most}: read as 12 bits, and as sRGB",)
+        pixels = cv2.convertScaleAbs(pixels, alpha=255 / most)
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
         raise InvalidImage(f"Pixels of type {pixels.dtype} are not supported: send 8 or 16 bits a channel.")
-    return np.asarray(pixels, np.uint8)
+    return np.asarray(pixels, np.uint8), warnings
 
 
 def _unturned_pixels(upright: NDArray[np.uint8], header: Header) -> NDArray[np.uint8]:
