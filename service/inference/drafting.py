@@ -113,7 +113,12 @@ def _sensor(exif: Exif, width_px: int, aspect: float, warnings: list[str]) -> tu
     """
     stated_px = _stated_width_px(exif, aspect)
     sensor_width_px = stated_px if stated_px and stated_px >= width_px else None
-    if sensor_width_px not in (None, width_px):
+    if _is_cut(exif, aspect):
+        warnings.append(
+            f"EXIF says {exif.width_px}x{exif.height_px} pixels, of which this is a part by its shape: k_cam of a part "
+            "is wrong, draft from the whole frame"
+        )
+    elif sensor_width_px not in (None, width_px):
         warnings.append(
             f"EXIF says {sensor_width_px} pixels wide and the file has {width_px}: taken as resized; a crop would "
             "make k_cam wrong"
@@ -127,6 +132,14 @@ def _sensor(exif: Exif, width_px: int, aspect: float, warnings: list[str]) -> tu
     sensor_width_px = sensor_width_px or width_px
     # a zoom enlarges a part of the sensor to as many pixels
     return round(1e3 * width_mm / sensor_width_px / _zoom(exif), 4) or None, sensor_width_px
+
+
+def _is_cut(exif: Exif, aspect: float) -> bool:
+    """Whether the picture has another shape than it had in the camera, however it was held."""
+    if not exif.width_px or not exif.height_px:
+        return False
+    stated = exif.width_px / exif.height_px
+    return not any(math.isclose(shape, aspect, rel_tol=ASPECT_TOLERANCE) for shape in (stated, 1 / stated))
 
 
 def _stated_width_px(exif: Exif, aspect: float) -> int | None:

@@ -176,6 +176,16 @@ def test_a_file_made_small_belongs_to_the_whole_sensor() -> None:
     assert said(drafted, "resized")
 
 
+def test_a_part_of_the_frame_is_told_by_its_shape_and_not_taken_for_a_small_copy() -> None:
+    stated: dict[str, Any] = {"make": "Apple", "model": None, "width_px": 4032, "height_px": 3024}
+    for width_px, height_px in ((2566, 3313), (2000, 3000), (4032, 2268)):
+        cut = draft(width_px, height_px, **stated)
+        assert said(cut, "4032x3024", "draft from the whole frame")
+        assert not said(cut, "resized")
+    for width_px, height_px in ((4032, 3024), (3024, 4032), (2016, 1512), (768, 1024)):
+        assert not said(draft(width_px, height_px, **stated), "whole frame")
+
+
 def test_a_frame_of_another_shape_is_told() -> None:
     assert said(draft(3872, 2178), "neither 4:3 nor 3:2")
 
