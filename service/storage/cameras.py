@@ -98,10 +98,12 @@ class Cameras:
     def revisions(self, name: str, limit: int, before: int | None = None) -> tuple[list[CameraRecord], bool]:
         """Up to ``limit`` revisions, the newest first, from the one before ``before``; and whether there are more.
 
-        Those of a deleted camera that had the name are among them. Raises ``NotFound``.
+        Those of a deleted camera that has or had the name are among them. Raises ``NotFound`` where none ever had it.
         """
         with reading(self._engine) as session:
-            row = _live(_find_row(session, self._owner, name), name)
+            row = _find_row(session, self._owner, name)
+            if row is None:
+                raise _unknown(name)
             query = select(CameraRevisionRow).where(col(CameraRevisionRow.camera_id) == row.id)
             if before is not None:
                 query = query.where(col(CameraRevisionRow.revision) < before)

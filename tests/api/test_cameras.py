@@ -367,6 +367,8 @@ def test_revisions_are_listed_newest_first_a_page_at_a_time(client: TestClient, 
     stored = [client.post("/cameras", json=phone).json()]
     stored += [client.put("/cameras/pixel7-wide", json=phone | {"k_cam_px": k}).json() for k in (1.5, 2.0)]
     client.delete("/cameras/pixel7-wide")
+    of_the_deleted = client.get("/cameras/pixel7-wide/revisions").json()["items"]
+    assert [one["revision"] for one in of_the_deleted] == [3, 2, 1]
     stored.append(client.post("/cameras", json=phone | {"k_cam_px": 2.5}).json())
     first = client.get("/cameras/pixel7-wide/revisions", params={"limit": 3}).json()
     rest = client.get("/cameras/pixel7-wide/revisions", params={"cursor": first["next_cursor"]}).json()
