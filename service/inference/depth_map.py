@@ -94,6 +94,30 @@ class Reading:
             Ratio.between(photograph_size, (camera.image_height_px, camera.image_width_px), manifest.stride),
         )
 
+    def at_focus(self, focus_distance_m: float, farthest_m: float) -> "Reading":
+        """What it is where the camera is focused there and blurs alike: depths and errors, none beyond ``farthest_m``.
+
+        ``camera`` stays the one that was read by. A change of inverse depth is a larger part of a farther depth: errors
+        are stated accordingly.
+        """
+        told_m = self.camera.focus_distance_m
+        if focus_distance_m == told_m:
+            return self
+        # float32 is not exact enough about a focus distance that is many times the other; at infinity it divides by 0
+        with np.errstate(divide="ignore"):
+            depth_m, other_m = (
+                thin_lens.depth_at_focus(values.astype(np.float64), told_m, focus_distance_m).astype(np.float32)
+                for values in (self.depth_m, self.other_m)
+            )
+        is_seen, is_other = ((values > 0) & (values <= np.float32(farthest_m)) for values in (depth_m, other_m))
+        error = np.minimum(self.error * (depth_m / self.depth_m), np.float32(MOST_STATED))
+        return replace(
+            self,
+            depth_m=np.where(is_seen, depth_m, np.float32(farthest_m)),
+            other_m=np.where(is_other, other_m, np.float32(np.nan)),
+            error=np.where(is_seen & (self.error <= MAX_RELATIVE_ERROR), error, NO_ANSWER),
+        )
+
 
 def least_error(depth_m: Array, camera: Camera) -> Array:
     """The floor of optics: no relative error below it is stated of a depth."""

@@ -213,7 +213,7 @@ class Estimator:
         def reading() -> Reading:
             answer = Reading.of(read.maps, read.camera, size, self.manifest, request.side, read.most_blur_px)
             settle(answer, limits_m, read.stride, max(request.rgb.shape[:2]) * read.scales[0])
-            return answer
+            return answer.at_focus(request.camera.focus_distance_m, farthest * request.camera.focus_distance_m)
 
         if _is_blank(request.rgb):
             told = reading()
@@ -229,8 +229,14 @@ class Estimator:
             unmet = clues.anchor(told, read, likeness)
         return told, (*clues.warnings, *unmet)
 
+    def _told(self, camera: Camera) -> Camera:
+        """The camera as the networks are told of it: for one focused farther than they know, one that blurs alike."""
+        farthest_m = max(self.manifest.ranges.focus_distance_m.high, 2 * (camera.focal_length_m or 0.0))
+        return camera.blurring_alike(farthest_m) if camera.focus_distance_m > farthest_m else camera
+
     def _base_scale(self, camera: Camera) -> float:
         """The largest copy whose k_cam the model reads well, or a smaller one of a large picture; never enlarged."""
+        camera = self._told(camera)
         at_most = min(WELL_READ_K_CAM_PX, self.manifest.ranges.k_cam_px.high) / camera.k_cam_px
         least = LEAST_PX / max(camera.image_width_px, camera.image_height_px)
         return min(1.0, max(at_most, least), max(_finest_scale(camera), FINE_K_CAM_PX / camera.k_cam_px))
@@ -269,7 +275,7 @@ class Estimator:
     def _read_copy(self, request: _Request, scale: float) -> Read:
         """What a copy of that scale shows; the layout is seen where all of it is not too wide."""
         area = request.area(scale, self.manifest.multiple)
-        working = _copied(area.behind(request.camera), scale)
+        working = _copied(area.behind(self._told(request.camera)), scale)
         rgb, size = area.of(request.rgb), (working.image_width_px, working.image_height_px)
         copy = rgb if size == rgb.shape[1::-1] else cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
         whole_px = max(request.rgb.shape[:2]) * scale

@@ -85,7 +85,8 @@ class Clues:
         )
         errors = np.exp(log_error) * SIGMA_OF_LAPLACE
         seen = [Sighting(*each) for each in zip((point.depth_m for point in known), blur_px, errors, strict=True)]
-        fit = fit_focus(read.camera, seen, None if side == "auto" else side == "near")
+        copied = read.camera.blurring_alike(camera.focus_distance_m)
+        fit = fit_focus(copied, seen, None if side == "auto" else side == "near")
         fitted = replace(camera.focused_at(fit.focus_distance_m), gamma_px=camera.gamma_px * fit.gamma_ratio)
         defocus = [thin_lens.signed_defocus(point.depth_m, fit.focus_distance_m) for point in known]
         leanings = tuple(max(-1.0, min(1.0, -x / SURELY_OUT)) for x in defocus)

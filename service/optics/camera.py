@@ -184,6 +184,11 @@ class Camera:
         )
         return replace(self, k_cam_px=k_cam_px, focus_distance_m=focus_distance_m)
 
+    def blurring_alike(self, focus_distance_m: float) -> "Camera":
+        """The camera focused there whose blur is this one's at ``thin_lens.depth_at_focus`` of every depth."""
+        k_cam_px = self.k_cam_px * (self.focus_distance_m / focus_distance_m)
+        return replace(self, focus_distance_m=focus_distance_m, k_cam_px=k_cam_px)
+
     def seen_through(self, lens: Lens) -> "Camera":
         """The same camera with the intrinsics its lens implies: square pixels, the axis in the middle."""
         size_px = (self.image_width_px, self.image_height_px)

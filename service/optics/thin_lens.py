@@ -190,6 +190,16 @@ def k_cam_at_focus(k_cam_px: float, focal_length_m: float, old_focus_m: float, n
     return k_cam_px * (old_focus_m - focal_length_m) / (new_focus_m - focal_length_m)
 
 
+def depth_at_focus(depth_m: Q, old_focus_m: float, new_focus_m: float) -> Q:
+    """The depth in metres as blurred at another focus distance, of the same aperture, as ``depth_m`` at the old one.
+
+    sigma is k_cam s1 |1/z - 1/s1| (eq. 3): with k_cam s1 kept, what is as far from focus in inverse depth is as
+    blurred. What would be farther than infinity is no positive number.
+    """
+    moved: Q = depth_m / (depth_m * (1 / new_focus_m - 1 / old_focus_m) + 1.0)
+    return moved
+
+
 def image_distance_in_focal_lengths(focus_distance_m: float, focal_length_m: float) -> float:
     """s2 / f = s1 / (s1 - f), without unit: how far behind a thin lens the plane in focus has its image."""
     return focus_distance_m / (focus_distance_m - focal_length_m)

@@ -55,6 +55,35 @@ def test_a_level_of_blur_becomes_the_thin_lens_depth_on_either_side(estimator: E
     assert (far.p_near == 0).all()
 
 
+@pytest.mark.parametrize("focus_m", [5.0, 5.001, 8.0, 30.0, 1e5])
+def test_a_lens_focused_far_away_tells_what_is_near_as_surely_as_one_focused_at_five_metres(
+    estimator: Estimator, focus_m: float
+) -> None:
+    camera = Camera(96, 64, 5.0, 2.0).blurring_alike(focus_m)
+    blur_px = camera.blur_px(1.5)
+    answer = estimator.estimate(grey(brightness_for(blur_px)), camera, "near")
+    depth_m = thin_lens.depth_near(expected_x(brightness_for(blur_px), camera), focus_m)
+    assert answer.warnings == ()
+    assert answer.camera == camera
+    np.testing.assert_allclose(answer.depth_m, depth_m, rtol=1e-4)
+    by_five_m = thin_lens.depth_at_focus(depth_m, focus_m, 5.0)
+    stated = np.sqrt(2) * LOG_DEPTH_SCALE * depth_m**2 / by_five_m
+    floor = thin_lens.depth_error(depth_m, focus_m, camera.k_cam_px, LEAST_BLUR_ERROR_PX)
+    np.testing.assert_allclose(answer.sigma_m, max(stated, floor), rtol=1e-3)
+
+
+def test_beyond_a_far_focus_depth_ends_where_blur_is_that_of_infinity(estimator: Estimator) -> None:
+    camera = Camera(96, 64, 20.0, 2.0)
+    seen, beyond = brightness_for(camera.blur_px(60.0)), brightness_for(1.2 * camera.blur_px(1e9))
+    answer = estimator.estimate(grey(seen), camera, "far")
+    np.testing.assert_allclose(answer.depth_m, thin_lens.depth_far(expected_x(seen, camera), 20.0), rtol=1e-3)
+    nothing = estimator.estimate(grey(beyond), camera, "far")
+    assert not nothing.valid.any()
+    near = estimator.estimate(grey(beyond), camera, "near")
+    assert near.valid.all()
+    assert np.isnan(near.depth_alt_m).all()
+
+
 def test_what_is_in_focus_is_on_neither_side(estimator: Estimator) -> None:
     sharp, blurred = brightness_for(CAMERA.gamma_px), 130
     found = [estimator.estimate(grey(level), CAMERA).p_near for level in (sharp, blurred)]
@@ -352,7 +381,7 @@ def test_a_few_cells_of_strong_blur_are_not_worth_a_second_copy(halving: Estimat
 
 
 def test_what_lies_outside_the_trained_ranges_is_said(estimator: Estimator) -> None:
-    camera = Camera(96, 64, 30.0, 0.2, 3.0, intrinsics=Intrinsics(20, 20, 48, 32))
+    camera = Camera(96, 64, 0.3, 0.2, 3.0, intrinsics=Intrinsics(20, 20, 48, 32))
     told = " / ".join(estimator.estimate(grey(60), camera).warnings)
     for name in ("k_cam_px", "gamma_px", "focus_distance_m", "fx_px"):
         assert name in told

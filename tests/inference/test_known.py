@@ -58,6 +58,18 @@ def test_the_answer_is_by_the_camera_focused_where_known_depths_say(estimator: E
     assert "where 2 m was told" in corrected.warnings[0]
 
 
+def test_the_focus_follows_from_known_depths_where_it_is_far_away_too(estimator: Estimator) -> None:
+    told = Camera(384, 256, 20.0, 1.5, 0.5)
+    true, depths_m = told.focused_at(16.0), (4.0, 10.0)
+    picture = np.empty((256, 384, 3), np.uint8)
+    picture[:, :192], picture[:, 192:] = (brightness_for(true.blur_px(depth_m)) for depth_m in depths_m)
+    known = tuple(replace(point, depth_m=depth_m) for point, depth_m in zip(KNOWN, depths_m, strict=True))
+    answer = estimator.estimate(picture, told, known=known)
+    assert answer.camera.focus_distance_m == pytest.approx(16.0, rel=0.1)
+    for point in known:
+        assert answer.depth_m[int(point.v), int(point.u)] == pytest.approx(point.depth_m, rel=0.03)
+
+
 def test_a_gamma_that_was_told_wrongly_follows_too(estimator: Estimator) -> None:
     blurry = replace(TRUE, gamma_px=1.0)
     picture = photograph()

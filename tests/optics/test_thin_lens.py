@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from service.optics import thin_lens
+from service.optics.camera import Camera
 
 focus = st.floats(0.1, 20.0)
 k_cams = st.floats(0.05, 300.0)
@@ -72,6 +73,15 @@ def test_moving_the_focus_is_computing_k_cam_there(old: float, new: float) -> No
     assert moved == pytest.approx(thin_lens.k_cam(0.05, 1.8, new, 4e-6), rel=1e-9)
 
 
+@given(st.floats(0.2, 1e5), st.floats(0.2, 1e5), st.floats(0.2, 0.99))
+def test_a_camera_that_blurs_alike_shows_each_depth_at_another(old: float, new: float, ratio: float) -> None:
+    camera = Camera(640, 480, old, 3.0)
+    moved_m = thin_lens.depth_at_focus(ratio * old, old, new)
+    assert camera.blurring_alike(new).blur_px(moved_m) == pytest.approx(camera.blur_px(ratio * old), rel=1e-6)
+    assert moved_m < new
+    assert thin_lens.depth_at_focus(moved_m, new, old) == pytest.approx(ratio * old, rel=1e-6)
+
+
 @pytest.mark.parametrize(
     "call", [lambda: thin_lens.k_cam(0.05, 2, 0.05, 4e-6), lambda: thin_lens.k_cam_at_focus(1, 2, 3, 2)]
 )
@@ -120,6 +130,7 @@ FORMULAS: list[Callable[[Any], Any]] = [
     lambda z: thin_lens.depth_near(z, 2.0),
     lambda z: thin_lens.depth_far(z, 2.0),
     lambda z: thin_lens.depth_error(z, 2.0, 3.81, 0.25),
+    lambda z: thin_lens.depth_at_focus(z, 2.0, 1e3),
     lambda z: thin_lens.relative_defocus_spread(z, 0.1 + 0 * z, 0.2, 3.81),
 ]
 POINTS = [0.3, 0.7, 1.3, 2.5, 4.0]
