@@ -31,6 +31,7 @@ LEAST_INERTIA = 0.15
 NEIGHBOURS = 8
 NESTED = 3  # blobs in one place, of which one may be a circle and another the outline of the sheet about it
 SEEDS = 40
+LEAST_PLACED = 4  # circles, from which what is hidden can be filled in
 MOST_TRIES = 16  # at laying a lattice, each from another seed or along other axes
 MOST_GROWN = 4  # times the circles wanted: a lattice that goes on is not the pattern
 ANGLES_DEG = (35.0, 145.0)
@@ -303,7 +304,7 @@ def _laid(cells: dict[Cell, int], blobs: _Blobs, wanted: list[Cell], grid: Circl
     if not ways:
         return None
     most = max(hits for _, _, hits in ways)
-    if most < LEAST_FOUND * len(wanted) or len(cells) - most > spare:
+    if most < max(LEAST_FOUND * len(wanted), LEAST_PLACED) or len(cells) - most > spare:
         return None
     options = []
     covered = set()

@@ -188,6 +188,14 @@ def test_a_picture_full_of_dots_is_told_apart_from_the_pattern() -> None:
         find_grid(np.tile(cell, (60, 80)), TALL)
 
 
+def test_three_of_four_circles_are_no_grid() -> None:
+    four = CircleGrid("symmetric_circles", 2, 2, 60.0, 40.0)
+    picture = without(four, view(four), [3])
+    cv2.circle(picture, (800, 100), 30, 25, -1)
+    with pytest.raises(GridError):
+        find_grid(picture, four)
+
+
 def test_blobs_are_looked_for_in_steps_that_can_be_stopped() -> None:
     class Stopped(Exception):
         pass
