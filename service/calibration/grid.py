@@ -7,7 +7,9 @@ pattern in every rotation.
 
 import math
 from collections.abc import Callable, Iterator
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,13 +144,16 @@ def _find(grey: NDArray[np.uint8], grid: CircleGrid, check: Callable[[], None]) 
     blobs = _blobs(grey, check)
     wanted = _lattice_cells(grid)
     best: dict[Cell, int] = {}
+    others: set[int] = set()  # in a lattice that goes on, as the holes of a board under the sheet are
     tries = 0
-    for first, u, v in _seeds(blobs):
+    for first, u, v in _seeds(blobs, others):
         check()
         cells = _grown(blobs, first, u, v, MOST_GROWN * len(wanted))
         if len(cells) > len(best):
             best = cells
-        if len(cells) >= LEAST_FOUND * len(wanted):
+        if len(cells) >= MOST_GROWN * len(wanted):
+            others.update(cells.values())
+        elif len(cells) >= LEAST_FOUND * len(wanted):
             found = _laid(cells, blobs, wanted, grid)
             tries += 1
             if found is not None:
@@ -226,23 +231,27 @@ def _is_alike(ratio: Array) -> NDArray[np.bool_]:
     return (ratio < LIKE_SIZE) & (ratio > 1 / LIKE_SIZE)
 
 
-def _seeds(blobs: _Blobs) -> Iterator[tuple[int, Array, Array]]:
-    """Blobs with two neighbours that may be those along the lattice's two axes, most regular surroundings first."""
+def _seeds(blobs: _Blobs, others: AbstractSet[int]) -> Iterator[tuple[int, Array, Array]]:
+    """Blobs with two neighbours that may be those along the lattice's two axes, most regular surroundings first.
+
+    None of the ``others``, which may become more meanwhile.
+    """
     count = min(NEIGHBOURS + 1, len(blobs.places))
-    away, others = (np.asarray(found) for found in blobs.tree.query(blobs.places, count))
+    away, beside = (np.asarray(found) for found in blobs.tree.query(blobs.places, count))
     evenness = away[:, min(4, count - 1)] / np.maximum(away[:, 1], 1e-6)
-    alike = np.ptp(np.log(blobs.sizes[others[:, : min(5, count)]]), axis=1)
-    for first in np.argsort(evenness + 2 * alike)[:SEEDS]:
-        steps = blobs.places[others[first, 1:]] - blobs.places[first]
-        sizes = blobs.sizes[others[first, 1:]] / blobs.sizes[first]
+    alike = np.ptp(np.log(blobs.sizes[beside[:, : min(5, count)]]), axis=1)
+    for first in islice((blob for blob in np.argsort(evenness + 2 * alike).tolist() if blob not in others), SEEDS):
+        steps = blobs.places[beside[first, 1:]] - blobs.places[first]
+        sizes = blobs.sizes[beside[first, 1:]] / blobs.sizes[first]
         steps = steps[_is_alike(sizes)]
         for i in range(min(4, len(steps))):
             for j in range(i + 1, min(5, len(steps))):
                 u, v = steps[i], steps[j]
                 angle = math.degrees(math.acos(np.clip(u @ v / np.linalg.norm(u) / np.linalg.norm(v), -1, 1)))
                 lengths = np.linalg.norm(u) / np.linalg.norm(v)
-                if ANGLES_DEG[0] < angle < ANGLES_DEG[1] and 1 / LIKE_LENGTH < lengths < LIKE_LENGTH:
-                    yield int(first), u, v
+                is_likely = ANGLES_DEG[0] < angle < ANGLES_DEG[1] and 1 / LIKE_LENGTH < lengths < LIKE_LENGTH
+                if is_likely and first not in others:
+                    yield first, u, v
 
 
 def _grown(blobs: _Blobs, first: int, u: Array, v: Array, most: int) -> dict[Cell, int]:
@@ -401,7 +410,10 @@ def _why(cells: dict[Cell, int], blobs: _Blobs, wanted: list[Cell], grid: Circle
     else:
         likeness = _likeness(cells, blobs, grid)
         seen = f"{len(cells)} circles was seen that is not the pattern given ({len(wanted)} circles){likeness}"
-    return f"a grid of {seen}: check kind, rows and columns, and that the picture is not mirrored"
+    return (
+        f"a grid of {seen}: check kind, rows and columns, that the picture is not mirrored, and that no dots or holes "
+        "are about the sheet"
+    )
 
 
 def _likeness(cells: dict[Cell, int], blobs: _Blobs, grid: CircleGrid) -> str:

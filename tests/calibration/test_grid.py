@@ -188,6 +188,19 @@ def test_a_picture_full_of_dots_is_told_apart_from_the_pattern() -> None:
         find_grid(np.tile(cell, (60, 80)), TALL)
 
 
+def test_a_sheet_on_a_board_of_holes_is_found() -> None:
+    matrix = view(TALL, turn_deg=10, lean=2, px_per_mm=1.3)
+    picture = drawn(TALL, matrix)
+    low, high = centres(TALL, matrix).min(0) - 30, centres(TALL, matrix).max(0) + 30
+    for x in range(200, WIDE, 32):
+        for y in range(20, HIGH, 32):
+            if not (low[0] < x < high[0] and low[1] < y < high[1]):
+                cv2.circle(picture, (x, y), 4, 25, -1)
+    found = find_grid(picture, TALL)
+    assert found.seen.all()
+    assert np.abs(found.centres_px - centres(TALL, matrix)).max() < 1
+
+
 def test_three_of_four_circles_are_no_grid() -> None:
     four = CircleGrid("symmetric_circles", 2, 2, 60.0, 40.0)
     picture = without(four, view(four), [3])
