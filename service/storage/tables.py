@@ -3,7 +3,7 @@
 from datetime import UTC, datetime
 
 from pydantic import JsonValue
-from sqlalchemy import JSON, Column, DateTime, Dialect, MetaData, Text, UniqueConstraint
+from sqlalchemy import JSON, Column, DateTime, Dialect, Index, MetaData, Text, UniqueConstraint
 from sqlalchemy.types import TypeDecorator
 from sqlmodel import Field, SQLModel
 
@@ -81,7 +81,7 @@ class CalibrationRow(SQLModel, table=True):
     """A calibration: what was asked, how far it is, and what came of it; kept when its photographs are gone."""
 
     __tablename__ = "calibrations"
-    __table_args__ = (UniqueConstraint("id"),)
+    __table_args__ = (UniqueConstraint("id"), Index("ix_calibrations_owner_number", "owner", "number"))
 
     # the order they came in; clients know the id alone
     number: int | None = Field(default=None, primary_key=True)

@@ -1,10 +1,12 @@
 """The queue of calibrations keeps its order and its promises, on SQLite and on PostgreSQL, under a race too."""
 
+import sqlite3
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
-from typing import Any
+from pathlib import Path
+from typing import Any, cast
 from uuid import uuid4
 
 import pytest
@@ -13,6 +15,7 @@ from sqlalchemy.exc import StatementError
 
 from service.errors import Conflict, NotFound
 from service.optics.camera import Camera, Intrinsics
+from service.storage import schema
 from service.storage.calibrations import (
     CalibrationDraft,
     CalibrationRecord,
@@ -22,7 +25,7 @@ from service.storage.calibrations import (
     StoredPicture,
 )
 from service.storage.cameras import CameraDraft, Cameras
-from service.storage.engine import writing
+from service.storage.engine import open_engine, writing
 from service.storage.tables import CalibrationRow
 from tests.fake_calibration import SETTINGS
 
@@ -231,6 +234,25 @@ def test_pages_follow_one_another_from_the_newest(calibrations: Calibrations) ->
     last, has_more = calibrations.page(2, after=middle[-1].id)
     assert ([item.id for item in last], has_more) == ([ids[0]], False)
     assert calibrations.page(2, after=uuid4().hex) == ([], False)
+
+
+def test_a_page_costs_no_look_at_the_calibrations_of_others(tmp_path: Path) -> None:
+    engine = open_engine(f"sqlite:///{tmp_path / 'camind.sqlite3'}")
+    schema.upgrade(engine)
+    calibrations = Calibrations(engine, "lab")
+    wanted = calibrations.add(draft()).id
+    with engine.connect() as connection:
+        driver = cast(sqlite3.Connection, connection.connection.driver_connection)
+    steps = []
+    driver.set_progress_handler(lambda: steps.append(1), 10)
+    calibrations.page(10)
+    alone = len(steps)
+    for _ in range(100):
+        Calibrations(engine, "others").add(draft())
+    steps.clear()
+    assert [summary.id for summary in calibrations.page(10)[0]] == [wanted]
+    assert len(steps) < alone + 10
+    engine.dispose()
 
 
 def test_what_has_ended_or_is_unknown_is_not_live(calibrations: Calibrations) -> None:
