@@ -34,6 +34,8 @@ app = typer.Typer(
 )
 cameras_app = typer.Typer(help="The cameras in the database.", no_args_is_help=True)
 app.add_typer(cameras_app, name="cameras")
+calibrations_app = typer.Typer(help="The calibrations in the database.", no_args_is_help=True)
+app.add_typer(calibrations_app, name="calibrations")
 keys_app = typer.Typer(help="The API keys: who may use the service.", no_args_is_help=True)
 app.add_typer(keys_app, name="keys")
 Owner = Annotated[str, typer.Option(help="Whose they are. [default: whoever uses the service without a key]")]
@@ -404,6 +406,18 @@ def _line_of(record: "CameraRecord") -> str:
     camera = record.camera
     size = f"{camera.image_width_px}x{camera.image_height_px}"
     return f"{record.name}\tr{record.revision}\t{camera.k_cam_px:.4g} px\t{camera.focus_distance_m:g} m\t{size}"
+
+
+@calibrations_app.command(name="prune")
+def prune_calibrations(
+    days: Annotated[float, typer.Option(help="How long what has ended is kept", min=1.0, max=MOST_DAYS)],
+) -> None:
+    """Delete, of every owner, what ended longer ago than that. The cameras that came of it stay."""
+    from service.storage.calibrations import Calibrations
+
+    with _plain_failures(), _ready_engine() as engine:
+        count = Calibrations(engine).forget(datetime.now(UTC) - timedelta(days=days))
+    typer.echo(f"deleted calibrations: {count}")
 
 
 @keys_app.command(name="create")

@@ -7,18 +7,26 @@ import sqlite3
 import subprocess
 import sys
 from contextlib import closing
+from datetime import timedelta
 from importlib.metadata import EntryPoint, version
 from pathlib import Path
+from uuid import uuid4
 
 import cv2
 import numpy as np
 import pytest
 import typer
+from sqlalchemy import update
+from sqlmodel import col
 from typer.testing import CliRunner, Result
 
 from service import cli
 from service.api.schemas import LENS_EXAMPLE
+from service.config import Settings
 from service.storage import schema
+from service.storage.calibrations import CalibrationDraft, Calibrations
+from service.storage.engine import open_engine, writing
+from service.storage.tables import CalibrationRow
 from tests.inference.oracle_pair import brightness_for
 from tests.simulated_sheets import CAMERA, DEPTHS_M, shots
 
@@ -269,6 +277,21 @@ def test_cameras_of_another_owner_are_told_of_where_one_s_own_are_missed() -> No
     missed = at_once("cameras", "show", "rear").stderr
     assert missed.startswith("There is no camera 'rear' of this owner, but 1 of robot (--owner): ")
     assert at_once("cameras", "show", "re\x00ar").stderr.startswith("There is no camera 're")
+
+
+def test_calibrations_that_just_ended_are_not_pruned(bench: Path) -> None:
+    engine = open_engine(Settings(data_dir=bench).effective_database_url)
+    calibrations = Calibrations(engine)
+    for _ in range(2):
+        calibrations.cancel(calibrations.add(CalibrationDraft(uuid4().hex, "a" * 32, "bench", {}, ())).id)
+    longest_ago = calibrations.page(2)[0][1]
+    with writing(engine) as session:
+        days_ago = update(CalibrationRow).where(col(CalibrationRow.id) == longest_ago.id)
+        session.connection().execute(days_ago.values(updated_at=longest_ago.updated_at - timedelta(days=31)))
+    assert at_once("calibrations", "prune", "--days", "30").stdout == "deleted calibrations: 1\n"
+    assert at_once("calibrations", "prune", "--days", "0").exit_code == 2
+    assert len(calibrations.page(2)[0]) == 1
+    engine.dispose()
 
 
 def test_a_photograph_in_which_nothing_is_seen_has_no_depth(bench: Path) -> None:

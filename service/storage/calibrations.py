@@ -6,13 +6,14 @@ photographs, of one data folder.
 """
 
 import re
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime, timedelta
 from typing import Literal, get_args
 
 from pydantic import JsonValue
-from sqlalchemy import Engine, func, update
+from sqlalchemy import Engine, delete, func, update
 from sqlmodel import Session, col, select
 
 from service.errors import Conflict, NotFound
@@ -30,6 +31,8 @@ LIVE: tuple[State, ...] = ("queued", "running")
 
 ID_PATTERN = r"^[0-9a-f]{32}$"
 ABANDONED_AFTER = timedelta(days=1)
+FORGOTTEN_AT_A_TIME = 50
+FORGETTING_PAUSE_S = 0.2  # who waits for SQLite's lock looks every 0.1 s
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,6 +266,26 @@ class Calibrations:
         )
         with writing(self._engine) as session:
             session.connection().execute(given_up)
+
+    def forget(self, ended_before: datetime) -> int:
+        """Delete what ended before then, a few at a time so that nobody else waits long; how many. Cameras stay."""
+        ended = (
+            select(CalibrationRow.number)
+            .where(~col(CalibrationRow.state).in_(LIVE), col(CalibrationRow.updated_at) < ended_before)
+            .order_by(col(CalibrationRow.number))
+            .limit(FORGOTTEN_AT_A_TIME)
+        )
+        if self._owner is not None:
+            ended = ended.where(col(CalibrationRow.owner) == self._owner)
+        forgotten = 0
+        while True:
+            with writing(self._engine) as session:
+                numbers = session.exec(ended).all()
+                session.connection().execute(delete(CalibrationRow).where(col(CalibrationRow.number).in_(numbers)))
+            forgotten += len(numbers)
+            if len(numbers) < FORGOTTEN_AT_A_TIME:
+                return forgotten
+            time.sleep(FORGETTING_PAUSE_S)
 
     def _add(self, draft: CalibrationDraft, once: Once | None) -> CalibrationRecord:
         now, owner = datetime.now(UTC), self._owner or LOCAL

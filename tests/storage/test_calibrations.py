@@ -262,6 +262,28 @@ def test_what_has_ended_or_is_unknown_is_not_live(calibrations: Calibrations) ->
     assert calibrations.live([]) == set()
 
 
+@pytest.mark.parametrize("owner", [None, "lab"])
+def test_what_ended_long_ago_is_forgotten_and_nothing_else(
+    engine: Engine, cameras: Cameras, monkeypatch: pytest.MonkeyPatch, owner: str | None
+) -> None:
+    monkeypatch.setattr("service.storage.calibrations.FORGOTTEN_AT_A_TIME", 2)
+    everybody, lab = Calibrations(engine), Calibrations(engine, "lab")
+    old = [ended(lab, state) for state in ("succeeded", "failed", "cancelled")]
+    others = running(everybody)
+    everybody.finish(others, replace(SUCCESS, camera=CAMERA))
+    waiting = everybody.add(draft()).id
+    now = datetime.now(UTC)
+    with writing(engine) as session:
+        session.connection().execute(update(CalibrationRow).values(updated_at=now - timedelta(days=2)))
+    new = everybody.add(draft()).id
+    everybody.cancel(new)
+    assert Calibrations(engine, owner).forget(now - timedelta(days=1)) == (4 if owner is None else 3)
+    kept = {summary.id for summary in everybody.page(10)[0]}
+    assert kept == {waiting, new} | ({others} if owner else set())
+    assert not kept & set(old)
+    assert cameras.get("bench").camera == CAMERA
+
+
 @pytest.mark.parametrize("name", ["nobody", "", "a\x00b", "A" * 32, "x" * 65, "f" * 32])
 def test_an_unknown_id_is_not_found(calibrations: Calibrations, name: str) -> None:
     actions: list[Callable[[], object]] = [lambda: calibrations.get(name), lambda: calibrations.cancel(name)]
