@@ -34,8 +34,8 @@ async def answer_error(request: Request, exc: Exception) -> Response:
 
 
 def log_fault(error: CamindError) -> None:
-    """Tell the log what is behind a fault of the service's own; a full queue is none."""
-    if error.status >= 500 and not isinstance(error, Busy):
+    """Tell the log what is behind a fault of the service's own; a full queue, which has no cause, is none."""
+    if error.status >= 500 and (error.__cause__ is not None or not isinstance(error, Busy)):
         log.error("unavailable", detail=error.detail, cause=repr(error.__cause__))
 
 

@@ -251,7 +251,11 @@ def test_a_busy_database_says_when_to_come_back(
     with engine.connect() as connection:
         connection.exec_driver_sql("COMMIT")
         connection.exec_driver_sql("BEGIN EXCLUSIVE")
-        answer = client.post("/cameras", json=phone)
+        with structlog.testing.capture_logs([structlog.contextvars.merge_contextvars]) as events:
+            answer = client.post("/cameras", json=phone)
         connection.exec_driver_sql("ROLLBACK")
     require_problem(answer, 503, "busy")
     assert int(answer.headers["retry-after"]) >= 1
+    (told,) = [event for event in events if event["event"] == "unavailable"]
+    assert "database is locked" in told["cause"]
+    assert told["request_id"] == answer.headers["x-request-id"]
