@@ -24,6 +24,7 @@ FIRST_SAFE_WAL = (3, 51, 3)
 IS_WRITE = "camind_is_write"
 SQLITE_DAMAGED = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 POSTGRESQL_DISK_FULL = "53100"
+POSTGRESQL_READ_ONLY = "25006"
 # a lock, or an answer, that took too long
 POSTGRESQL_BUSY = ("55P03", "57014")
 
@@ -35,7 +36,7 @@ def open_engine(database_url: str | URL) -> Engine:
         return _open_postgresql(url)
     if url.database and url.database != ":memory:":
         Path(url.database).parent.mkdir(parents=True, exist_ok=True)
-    engine = create_engine(url, pool_timeout=POOL_TIMEOUT_S)
+    engine = create_engine(url, pool_timeout=POOL_TIMEOUT_S, hide_parameters=True)
     event.listen(engine, "connect", _prepare_sqlite)
     event.listen(engine, "begin", _begin_sqlite)
     return engine
@@ -45,7 +46,9 @@ def _open_postgresql(url: URL) -> Engine:
     from service.storage import postgresql  # which needs an extra
 
     arguments = postgresql.connect_args(url)
-    engine = create_engine(url, pool_timeout=POOL_TIMEOUT_S, pool_pre_ping=True, connect_args=arguments)
+    engine = create_engine(
+        url, pool_timeout=POOL_TIMEOUT_S, pool_pre_ping=True, hide_parameters=True, connect_args=arguments
+    )
     postgresql.bound(engine)
     return engine
 
@@ -142,7 +145,7 @@ def _unavailable(error: DatabaseError) -> CamindError:
         return InsufficientStorage("The database's disk is full and nothing was stored: try again when there is room.")
     if primary in SQLITE_DAMAGED:
         return NotReady("The database is damaged: stop the service, and `camind restore` a backup.")
-    if primary == sqlite3.SQLITE_READONLY:
+    if primary == sqlite3.SQLITE_READONLY or state == POSTGRESQL_READ_ONLY:
         return NotReady("The database takes no writes.")
     if "locked" in str(error.orig) or state in POSTGRESQL_BUSY:
         return Busy("The database is busy: try again in a second.")

@@ -50,6 +50,7 @@ def test_a_revision_needs_its_camera(engine: Engine) -> None:
         camera_id=99,
         revision=1,
         created_at=datetime.now(UTC),
+        description="lens of a secret prototype",
         source="given",
         image_width_px=1,
         image_height_px=1,
@@ -58,8 +59,9 @@ def test_a_revision_needs_its_camera(engine: Engine) -> None:
         gamma_px=1,
         k_r=4,
     )
-    with pytest.raises(IntegrityError), writing(engine) as session:
+    with pytest.raises(IntegrityError) as refused, writing(engine) as session:
         session.add(orphan)
+    assert "lens of a secret prototype" not in str(refused.value)  # which a traceback in the log would show
 
 
 def test_a_database_without_tables_is_not_ready(empty_engine: Engine) -> None:
@@ -111,6 +113,18 @@ def test_a_table_that_stays_locked_is_busy(hurried: Engine) -> None:
             Cameras(hurried).page(1)
         with pytest.raises(Busy):
             require_writable(hurried)
+    assert Cameras(hurried).page(1) == ([], False)
+
+
+def test_a_server_that_only_reads_takes_no_writes(hurried: Engine) -> None:
+    schema.upgrade(hurried)
+    with hurried.begin() as connection:
+        connection.exec_driver_sql(
+            "ALTER DATABASE " + str(hurried.url.database) + " SET default_transaction_read_only = on"
+        )
+    hurried.dispose()
+    with pytest.raises(NotReady, match="takes no writes"):
+        require_writable(hurried)
     assert Cameras(hurried).page(1) == ([], False)
 
 
