@@ -162,6 +162,7 @@ def _start(app: FastAPI) -> None:
         app.state.spool,
         ImageLimits.of(settings),
         app.state.calibrate,
+        app.state.metrics.count_problem,
     )
     app.state.runner.start()
     if app.state.tracing is not None:

@@ -71,11 +71,19 @@ RESULT = TypeAdapter(Result)
 class Runner:
     """Works a spool off in a thread of its own, between ``start`` and ``close``."""
 
-    def __init__(self, calibrations: Calibrations, spool: Spool, limits: ImageLimits, calibrate: Calibrate) -> None:
+    def __init__(
+        self,
+        calibrations: Calibrations,
+        spool: Spool,
+        limits: ImageLimits,
+        calibrate: Calibrate,
+        count_problem: Callable[[str], None],
+    ) -> None:
         self._calibrations = calibrations
         self._spool = spool
         self._limits = limits
         self._calibrate = calibrate
+        self._count_problem = count_problem
         self._is_ready = False
         self._gave_up_s = -GIVE_UP_S
         self._wake = threading.Event()
@@ -106,6 +114,7 @@ class Runner:
                 is_done = True
             except Exception:
                 log.exception("calibrations_wait")
+                self._count_problem(CamindError.code)
                 is_done = True
             if is_done:
                 self._wake.wait(LOOK_S)
@@ -147,6 +156,7 @@ class Runner:
                 return True
             except Exception:
                 log.exception("calibration_failed")
+                self._count_problem(CamindError.code)
                 ending = Ending(
                     "failed", problem="Something went wrong here; the log has it under the calibration's id."
                 )

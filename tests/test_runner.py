@@ -55,6 +55,7 @@ class Bench:
         self.calibrations = calibrations
         self.spool = spool
         self.runners: list[Runner] = []
+        self.problems: list[str] = []
 
     def queue(self, *pictures: bytes, register: bool = False) -> str:
         calibration_id = uuid4().hex
@@ -67,7 +68,7 @@ class Bench:
         return calibration_id
 
     def run(self, calibrate: Calibrate) -> Runner:
-        runner = Runner(self.calibrations, self.spool, ImageLimits(max_pixels=64 * 48), calibrate)
+        runner = Runner(self.calibrations, self.spool, ImageLimits(max_pixels=64 * 48), calibrate, self.problems.append)
         runner.start()
         self.runners.append(runner)
         return runner
@@ -149,6 +150,7 @@ def test_a_defect_fails_in_plain_words_and_tells_the_log(bench: Bench) -> None:
     assert record.state == "failed"
     assert "1234" not in str(record)
     assert "Traceback" not in str(record)
+    assert bench.problems == ["internal-error"] * 2
     failures = [event for event in events if event["event"] == "calibration_failed"]
     assert [event["calibration"] for event in failures] == [first, second]
     assert failures[0]["exc_info"]

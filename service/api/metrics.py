@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib.metadata import version
 
 from fastapi import APIRouter, Request, Response
 from prometheus_client import (
@@ -39,6 +40,7 @@ class Parts(Collector):
 
     def collect(self) -> Iterator[Metric]:
         worker = self.worker
+        yield InfoMetricFamily("camind_build", "The version that runs", value={"version": version("camind")})
         yield InfoMetricFamily("camind_model", "The model that answers", value={"name": self.model})
         for name, meaning, value in (
             ("camind_depth_in_flight", "Photographs being worked on or waiting", worker.in_flight),
@@ -89,7 +91,10 @@ class Metrics:
             registry=self.registry,
         )
         self._problems = Counter(
-            "camind_problems", "Answers that refuse, by the problem's code", ("code",), registry=self.registry
+            "camind_problems",
+            "Answers that refuse and defects that end a calibration, by code",
+            ("code",),
+            registry=self.registry,
         )
         for code in sorted(known_codes()):
             self._problems.labels(code)  # a series that began at 1 would hide the first one from increase()
@@ -111,7 +116,7 @@ class Metrics:
         self._duration_s.labels(method, path).observe(duration_s)
 
     def count_problem(self, code: str) -> None:
-        """One answer that was a problem, by the code of its class."""
+        """One answer, or a calibration's end, that was a problem, by the code of its class."""
         self._problems.labels(code).inc()
 
     def time_wait(self, wait_s: float) -> None:

@@ -1,7 +1,8 @@
 """What ``GET /metrics`` says of requests, queues, slots, calibrations, refusals and the process when it is asked."""
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,12 @@ from starlette.testclient import TestClient
 
 from model_export.served import serving
 from service import errors
+from service.app import create_app
+from service.config import Settings
 from service.inference.cancellation import Cancellation
 from service.storage import schema
 from service.storage.calibrations import CalibrationDraft, Calibrations
-from tests.fake_calibration import SETTINGS
+from tests.fake_calibration import SETTINGS, FakeCalibration, calibration_form
 from tests.inference.photographs import corners, png
 
 Labels = tuple[tuple[str, str], ...]
@@ -107,6 +110,22 @@ def test_calibrations_are_counted_by_state(client: TestClient, app: FastAPI) -> 
     assert figure(client, "camind_calibrations", state="queued") == 2
     assert figure(client, "camind_calibrations", state="running") == 1
     assert figure(client, "camind_calibration_queue_size") == 8
+
+
+def test_the_version_that_runs_is_told(client: TestClient) -> None:
+    assert figure(client, "camind_build_info", version=version("camind")) == 1
+
+
+@pytest.mark.parametrize(("outcome", "defects"), [(lambda: 1 / 0, 1), (lambda: None, 0)])
+def test_a_defect_that_ends_a_calibration_is_counted_and_poor_photographs_are_not(
+    settings: Settings, outcome: Callable[[], Any], defects: int
+) -> None:
+    with TestClient(create_app(settings, FakeCalibration(outcome))) as client:
+        form = calibration_form(png(corners()))
+        kind = {"Content-Type": form.headers["content-type"], "Prefer": "wait=20"}
+        answer = client.post("/calibrate?camera=bench", content=form.content, headers=kind)
+        assert answer.json()["state"] == "failed"
+        assert figure(client, "camind_problems_total", code="internal-error") == defects
 
 
 def test_a_database_that_cannot_be_asked_hides_no_other_figure(client: TestClient, app: FastAPI) -> None:
