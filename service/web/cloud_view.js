@@ -48,7 +48,7 @@ export function CloudView({ reader, result, look, hasPhotograph, isShown }) {
 		if (!isShown || tell === null) return;
 		reader
 			.ask("cloud", { most: MOST_POINTS, look, isPhotograph: isOfPhotograph })
-			.then((points) => tell.to({ kind: "show", points }, [points.positions.buffer, points.colours.buffer]));
+			.then((points) => tell.to(["show", points], [points.positions.buffer, points.colours.buffer]));
 	}, [tell, isShown, result, isOfPhotograph, coloured]);
 
 	if (!hasPoints || isMissing) {
@@ -71,9 +71,9 @@ export function CloudView({ reader, result, look, hasPhotograph, isShown }) {
 			aria-describedby="depth-cloud-hint"
 		></canvas>
 		<div class="row">
-			<button type="button" onClick=${act({ kind: "zoom", factor: ZOOM })} aria-label="Nearer">+</button>
-			<button type="button" onClick=${act({ kind: "zoom", factor: 1 / ZOOM })} aria-label="Farther">−</button>
-			<button type="button" onClick=${act({ kind: "reset" })}>Reset view</button>
+			<button type="button" onClick=${act(["zoom", ZOOM])} aria-label="Nearer">+</button>
+			<button type="button" onClick=${act(["zoom", 1 / ZOOM])} aria-label="Farther">−</button>
+			<button type="button" onClick=${act(["reset"])}>Reset view</button>
 			${hasPhotograph &&
 			html`<label class="choice">
 				<input
@@ -103,19 +103,19 @@ function drawOn(canvas, onMissing) {
 		else canvas.dataset.points = data.drawn;
 	};
 	const drawn = canvas.transferControlToOffscreen();
-	worker.postMessage({ kind: "open", canvas: drawn }, [drawn]);
+	worker.postMessage(drawn, [drawn]);
 	return worker;
 }
 
 /** Size, pointers, wheel and keys for the view. @param {HTMLCanvasElement} canvas @param {Tell} tell @returns {() => void} what ends it */
 function handle(canvas, tell) {
-	const orbit = (/** @type {number} */ right, /** @type {number} */ down) => tell({ kind: "orbit", right, down });
-	const zoom = (/** @type {number} */ factor) => tell({ kind: "zoom", factor });
-	const reset = () => tell({ kind: "reset" });
+	const orbit = (/** @type {number} */ right, /** @type {number} */ down) => tell(["orbit", right, down]);
+	const zoom = (/** @type {number} */ factor) => tell(["zoom", factor]);
+	const reset = () => tell(["reset"]);
 	const sized = new ResizeObserver(([{ contentRect }]) => {
 		const dense = Math.min(MOST_DENSE, devicePixelRatio);
 		const [width, height] = [contentRect.width, contentRect.height].map((length) => Math.round(length * dense));
-		if (width > 0) tell({ kind: "resize", width, height });
+		if (width > 0) tell(["resize", width, height]);
 	});
 	sized.observe(canvas);
 	/** @type {Map<number, {x: number, y: number}>} */

@@ -45,6 +45,12 @@ const SIDES = [
 	["near", "Nearer than focus"],
 	["far", "Beyond focus"],
 ];
+const STEPS = {
+	upload: "Sending",
+	work: "Waiting for a slot, reading the blur:",
+	receive: "Receiving the answer",
+	draw: "Drawing",
+};
 const PHOTOGRAPH_MOST_PX = 1600;
 const NOT_THE_FRAME = "urn:camind:problem:image-size-mismatch";
 const NO_PHOTOGRAPH = /:(invalid-image|unsupported-kind)$/;
@@ -450,20 +456,10 @@ function Progress({ phase, onCancel }) {
 	if (phase === null) return null;
 	const fraction = "fraction" in phase ? phase.fraction : null;
 	const part = fraction ? ` ${Math.round(100 * fraction)} %` : "";
-	const says = {
-		upload: () => `Sending${part}`,
-		receive: () => `Receiving the answer${part}`,
-		work: () =>
-			phase.step === "work" && `Waiting for a slot, reading the blur: ${((performance.now() - phase.since) / 1000).toFixed(1)} s`,
-		draw: () => "Drawing",
-	}[phase.step];
+	const time = "since" in phase ? ` ${((performance.now() - phase.since) / 1000).toFixed(1)} s` : "";
 	return html`<div class="depth-progress">
-		<progress
-			key=${phase.step}
-			aria-label="Progress"
-			value=${fraction ?? undefined}
-		></progress>
-		<span class="number">${says()}</span>
+		<progress key=${phase.step} aria-label="Progress" value=${fraction ?? undefined}></progress>
+		<span class="number">${STEPS[phase.step]}${part}${time}</span>
 		<button type="button" onClick=${onCancel}>Cancel</button>
 	</div>`;
 }

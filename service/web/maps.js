@@ -181,7 +181,6 @@ export class DepthMaps {
 		const colours = colourTable(map);
 		const pixels = new ImageData(width, height);
 		const words = new Uint32Array(pixels.data.buffer);
-		const bytes = pixels.data;
 		const counts = new Uint32Array(BINS);
 		const columns = Uint32Array.from({ length: width }, (_, x) => Math.floor(((x + 0.5) * this.width) / width));
 		const scale = 1 / Math.log(farM / nearM);
@@ -205,10 +204,7 @@ export class DepthMaps {
 					words[to] = isBright ? 0xff000000 : 0xffffffff;
 					continue;
 				}
-				bytes[4 * to] = colours[colour];
-				bytes[4 * to + 1] = colours[colour + 1];
-				bytes[4 * to + 2] = colours[colour + 2];
-				bytes[4 * to + 3] = 255;
+				words[to] = 0xff000000 | (colours[colour + 2] << 16) | (colours[colour + 1] << 8) | colours[colour];
 			}
 		}
 		return { pixels, counts };

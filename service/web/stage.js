@@ -72,14 +72,14 @@ export function Stage(props) {
 
 	const boxOf = () => /** @type {HTMLElement} */ (stage.current).getBoundingClientRect();
 
+	const within = (/** @type {number} */ u, /** @type {number} */ v) => ({
+		u: Math.min(size.width - 1, Math.max(0, Math.floor(u))),
+		v: Math.min(size.height - 1, Math.max(0, Math.floor(v))),
+	});
+
 	const pixelAt = (/** @type {PointerEvent} */ { clientX, clientY }) => {
-		const box = boxOf();
-		const along = (/** @type {number} */ share, /** @type {number} */ length) =>
-			Math.min(length - 1, Math.max(0, Math.floor(share * length)));
-		return {
-			u: along((clientX - box.left) / box.width, size.width),
-			v: along((clientY - box.top) / box.height, size.height),
-		};
+		const { left, top, width, height } = boxOf();
+		return within(((clientX - left) / width) * size.width, ((clientY - top) / height) * size.height);
 	};
 
 	/** @param {PointerEvent} event */
@@ -130,10 +130,7 @@ export function Stage(props) {
 		if (move) {
 			const [across, down] = reading ? move : [0, 0];
 			isByKeys.current = true;
-			read({
-				u: Math.min(size.width - 1, Math.max(0, u + across)),
-				v: Math.min(size.height - 1, Math.max(0, v + down)),
-			});
+			read(within(u + across, v + down));
 		} else if ((event.key === "Enter" || event.key === " ") && reading) {
 			mark({ u, v });
 		} else if (event.key === "Escape") {
