@@ -47,15 +47,30 @@ export function problemOf(error) {
 	throw error;
 }
 
-/** @returns {string | null} the API key of this tab */
-export function storedKey() {
-	return sessionStorage.getItem(KEY);
+/** @type {string | null} */
+let held = null;
+try {
+	held = sessionStorage.getItem(KEY);
+} catch {
+	// a browser that stores nothing for a page still shows it
 }
 
-export function forgetKey() {
-	sessionStorage.removeItem(KEY);
+/** @returns {string | null} the API key of this tab */
+export const storedKey = () => held;
+
+/** @param {string | null} key */
+function holdKey(key) {
+	held = key;
+	try {
+		if (key === null) sessionStorage.removeItem(KEY);
+		else sessionStorage.setItem(KEY, key);
+	} catch {
+		// it is held until the page is left
+	}
 	dispatchEvent(new Event(KEY_CHANGED));
 }
+
+export const forgetKey = () => holdKey(null);
 
 /** @type {KeyAsker} */
 let ask = async () => null;
@@ -74,10 +89,7 @@ async function askedKey(reason) {
 		asking = null;
 	});
 	const key = await asking;
-	if (key !== null && key !== storedKey()) {
-		sessionStorage.setItem(KEY, key);
-		dispatchEvent(new Event(KEY_CHANGED));
-	}
+	if (key !== null && key !== held) holdKey(key);
 	return key;
 }
 
