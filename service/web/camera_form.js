@@ -45,11 +45,13 @@ export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 	const [isSaving, setIsSaving] = useState(false);
 	const { preview, faults: previewFaults } = usePreview(fields);
 	const title = useRef(/** @type {HTMLHeadingElement | null} */ (null));
+	const trouble = useRef(/** @type {HTMLElement | null} */ (null));
 	const faults = [...unclear(fields), ...previewFaults, ...(problem?.errors ?? [])];
 	const missing = missingOf(fields);
 	const refocused = refocusedKCam(fields, held);
 
 	useEffect(() => arriveAt(title.current), []);
+	useEffect(() => arriveAt(problem || theirs ? trouble.current : null), [problem, theirs]);
 
 	/** @param {Fields} changed */
 	function change(changed) {
@@ -69,6 +71,7 @@ export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 			if (!(error instanceof Problem)) throw error;
 			if (error.status === 412) await showTheirs();
 			else setProblem(error);
+			if (error.status === 404) setBase(null); // deleted meanwhile: what is typed can be stored anew
 		} finally {
 			setIsSaving(false);
 		}
@@ -116,24 +119,26 @@ export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 				<h3 id="camera-form-title" tabindex="-1" ref=${title}>${base ? `Edit ${base.name}` : "New camera"}</h3>
 				${base && html`<span class="badge">revision ${base.revision}</span>`}
 			</div>
-			${theirs &&
-			html`<${Conflict}
-				base=${base}
-				theirs=${theirs}
-				fields=${fields}
-				onMine=${() => {
-					setTheirs(null);
-					setBase(theirs);
-					save(theirs.revision);
-				}}
-				onTheirs=${() => {
-					setTheirs(null);
-					setBase(theirs);
-					setFields(fieldsOf(theirs));
-					setHeld(theirs);
-				}}
-			/>`}
-			<${ProblemBox} problem=${problem} />
+			<div ref=${trouble} tabindex="-1" hidden=${!problem && !theirs}>
+				${theirs &&
+				html`<${Conflict}
+					base=${base}
+					theirs=${theirs}
+					fields=${fields}
+					onMine=${() => {
+						setTheirs(null);
+						setBase(theirs);
+						save(theirs.revision);
+					}}
+					onTheirs=${() => {
+						setTheirs(null);
+						setBase(theirs);
+						setFields(fieldsOf(theirs));
+						setHeld(theirs);
+					}}
+				/>`}
+				<${ProblemBox} problem=${problem} />
+			</div>
 			<label class="field">
 				Fill in from a photograph it took
 				<input type="file" accept=${PHOTOGRAPHS} onChange=${fillFromPhotograph} />
