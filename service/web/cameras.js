@@ -15,6 +15,9 @@ const SOURCES = { given: "given", lens: "from lens specs", calibration: "calibra
 
 /** @typedef {{kind: "none"} | {kind: "read", name: string} | {kind: "new"} | {kind: "edit", camera: any}} Open */
 
+/** Ask before the page goes. @param {Event} event */
+const stay = (event) => event.preventDefault();
+
 /** @param {import("./app.js").ViewProps} props */
 export function CamerasView({ shown, cameras, camera, reloadCameras, go, announce }) {
 	const [open, setOpen] = useState(/** @type {Open} */ ({ kind: "none" }));
@@ -30,6 +33,12 @@ export function CamerasView({ shown, cameras, camera, reloadCameras, go, announc
 
 	const isTyped = useRef(false);
 
+	/** @param {boolean} is */
+	function setTyped(is) {
+		isTyped.current = is;
+		(is ? addEventListener : removeEventListener)("beforeunload", stay);
+	}
+
 	useEffect(() => {
 		const { kind } = open;
 		const name = kind === "read" ? open.name : kind === "edit" ? open.camera.name : null;
@@ -43,7 +52,7 @@ export function CamerasView({ shown, cameras, camera, reloadCameras, go, announc
 
 	/** @param {Open} next */
 	function turnTo(next) {
-		isTyped.current = false;
+		setTyped(false);
 		setOpen(next);
 	}
 
@@ -138,9 +147,7 @@ export function CamerasView({ shown, cameras, camera, reloadCameras, go, announc
 						key=${open.kind === "edit" ? open.camera.name : ""}
 						editing=${open.kind === "edit" ? open.camera : null}
 						onSaved=${(/** @type {any} */ stored, /** @type {string} */ words) => changed(stored.name, words)}
-						onTyped=${() => {
-							isTyped.current = true;
-						}}
+						onTyped=${() => setTyped(true)}
 						onCancel=${() => show(open.kind === "edit" ? open.camera.name : null)}
 					/>`}
 					${open.kind === "read" && cameras && !read && html`<p class="notice">There is no camera ${open.name}.</p>`}
