@@ -115,13 +115,19 @@ async function withKey(send, toProblem, { headers = {}, asks = true }) {
 	}
 }
 
-/** @param {unknown} error */
-function asProblem(error) {
+/** @param {unknown} error @param {unknown} [body] that was sent */
+async function asProblem(error, body) {
 	const isOurs = error instanceof Problem || (error instanceof DOMException && error.name === "AbortError");
-	return isOurs ? error : noAnswer();
+	return isOurs ? error : noAnswer(body);
 }
 
-function noAnswer() {
+/** @param {unknown} body */
+async function noAnswer(body) {
+	const isReadable = !(body instanceof Blob) || (await body.slice(0, 1).arrayBuffer().catch(() => null));
+	if (!isReadable) {
+		const detail = "It is a folder, or was changed or moved since it was chosen: choose it again.";
+		return new Problem({ status: 400, title: "The browser cannot read the file.", detail });
+	}
 	const detail = "Check that it runs and that this device reaches it, then try again.";
 	return new Problem({ status: 0, title: "The service does not answer.", detail });
 }
@@ -160,7 +166,7 @@ export async function request(path, options = {}) {
 			options,
 		);
 	} catch (error) {
-		throw asProblem(error);
+		throw await asProblem(error, body);
 	}
 }
 
@@ -175,7 +181,7 @@ export async function readBody(answer, kind) {
 	try {
 		return await answer[kind]();
 	} catch (error) {
-		throw asProblem(error);
+		throw await asProblem(error);
 	}
 }
 
@@ -277,7 +283,7 @@ function sendWithProgress(path, { method = "POST", headers = {}, body = null, si
 			const pairs = lines.map((line) => /** @type {[string, string]} */ (line.split(/:\s*(.*)/s).slice(0, 2)));
 			resolve({ status: sent.status, headers: new Headers(pairs.filter(([name]) => name)), body: sent.response });
 		};
-		sent.onerror = () => reject(noAnswer());
+		sent.onerror = () => noAnswer(body).then(reject);
 		sent.onabort = () => reject(new DOMException("The request was aborted.", "AbortError"));
 		sent.onloadend = () => signal?.removeEventListener("abort", abort);
 		signal?.addEventListener("abort", abort);
@@ -308,7 +314,7 @@ export async function events(path, { signal, onEvent }) {
 			for (const block of blocks) readEvent(block, onEvent);
 		}
 	} catch (error) {
-		throw asProblem(error);
+		throw await asProblem(error);
 	}
 }
 
