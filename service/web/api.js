@@ -23,16 +23,18 @@ export const KEY_CHANGED = "camind:key";
 
 /** Why a request failed: the service's problem+json, or that it does not answer (status 0). */
 export class Problem extends Error {
-	/** @param {{status: number, title: string, detail: string, type?: string, errors?: FieldProblem[], requestId?: string | null, retryAfterS?: number | null}} about */
-	constructor({ status, title, detail, type = "about:blank", errors = [], requestId = null, retryAfterS = null }) {
-		super(detail);
-		this.status = status;
-		this.type = type;
-		this.title = title;
-		this.detail = detail;
-		this.errors = errors;
-		this.requestId = requestId;
-		this.retryAfterS = retryAfterS;
+	status = 0;
+	title = "";
+	detail = "";
+	type = "about:blank";
+	errors = /** @type {FieldProblem[]} */ ([]);
+	requestId = /** @type {string | null} */ (null);
+	retryAfterS = /** @type {number | null} */ (null);
+
+	/** @param {{status: number, title: string, detail: string} & Partial<Problem>} about */
+	constructor(about) {
+		super(about.detail);
+		Object.assign(this, about);
 	}
 
 	/** Whether the same request may fare better later, or with a key. */
@@ -185,14 +187,12 @@ export async function readBody(answer, kind) {
 	}
 }
 
-/** @param {string} path @param {RequestOptions} [options] @returns {Promise<any>} */
-export const getJson = async (path, options) => readBody(await request(path, options), "json");
+/** @type {(kind: "json" | "blob" | "text") => (path: string, options?: RequestOptions) => Promise<any>} */
+const getter = (kind) => async (path, options) => readBody(await request(path, options), kind);
 
-/** @param {string} path @param {RequestOptions} [options] @returns {Promise<Blob>} */
-export const getBlob = async (path, options) => readBody(await request(path, options), "blob");
-
-/** @param {string} path @param {RequestOptions} [options] @returns {Promise<string>} */
-export const getText = async (path, options) => readBody(await request(path, options), "text");
+export const getJson = getter("json");
+export const getBlob = getter("blob");
+export const getText = getter("text");
 
 /** @param {Headers} headers of an answer of `POST /depth` */
 export function readDepthHeaders(headers) {

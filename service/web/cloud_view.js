@@ -9,6 +9,18 @@ const MOST_POINTS = 300_000;
 const ZOOM = 1.25;
 const TURN = 0.05;
 const MOST_DENSE = 2;
+/** @type {Record<string, Order>} */
+const KEYS = {
+	ArrowLeft: ["orbit", -TURN, 0],
+	ArrowRight: ["orbit", TURN, 0],
+	ArrowUp: ["orbit", 0, -TURN],
+	ArrowDown: ["orbit", 0, TURN],
+	"+": ["zoom", ZOOM],
+	"=": ["zoom", ZOOM],
+	"-": ["zoom", 1 / ZOOM],
+	0: ["reset"],
+	Home: ["reset"],
+};
 
 /**
  * @param {{
@@ -111,7 +123,6 @@ function drawOn(canvas, onMissing) {
 function handle(canvas, tell) {
 	const orbit = (/** @type {number} */ right, /** @type {number} */ down) => tell(["orbit", right, down]);
 	const zoom = (/** @type {number} */ factor) => tell(["zoom", factor]);
-	const reset = () => tell(["reset"]);
 	const sized = new ResizeObserver(([{ contentRect }]) => {
 		const dense = Math.min(MOST_DENSE, devicePixelRatio);
 		const [width, height] = [contentRect.width, contentRect.height].map((length) => Math.round(length * dense));
@@ -147,21 +158,9 @@ function handle(canvas, tell) {
 		zoom(Math.exp(-event.deltaY / 500));
 	});
 	on("keydown", (event) => {
-		/** @type {Record<string, () => void>} */
-		const keys = {
-			ArrowLeft: () => orbit(-TURN, 0),
-			ArrowRight: () => orbit(TURN, 0),
-			ArrowUp: () => orbit(0, -TURN),
-			ArrowDown: () => orbit(0, TURN),
-			"+": () => zoom(ZOOM),
-			"=": () => zoom(ZOOM),
-			"-": () => zoom(1 / ZOOM),
-			0: reset,
-			Home: reset,
-		};
-		if (!(event.key in keys) || event.altKey || event.ctrlKey || event.metaKey) return;
+		if (!(event.key in KEYS) || event.altKey || event.ctrlKey || event.metaKey) return;
 		event.preventDefault();
-		keys[event.key]();
+		tell(KEYS[event.key]);
 	});
 	return () => {
 		sized.disconnect();

@@ -10,7 +10,7 @@ export function Readout({ reading, focusM }) {
 	return html`<section class="card stack depth-readout" aria-label="Under the pointer">
 		<h3>Under the pointer</h3>
 		${reading === null
-			? html`<p class="depth-metres depth-none">–</p>
+			? html`<p class="depth-metres hint">–</p>
 					<p class="hint">Point at the picture, or go into it with Tab and the arrow keys.</p>`
 			: html`<p class="depth-metres">
 						${reading.depthM === null

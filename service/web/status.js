@@ -134,9 +134,9 @@ function Readiness({ ready, samples, at, onRetry }) {
 	const fault = ready?.status === 0 ? "No answer" : "Not ready";
 	const [tone, words] = ready === null ? ["", "Asking …"] : isFault ? ["bad", fault] : ["good", "Ready"];
 	return html`
-		<section class="card" aria-labelledby="ready-title">
+		<section class="card" aria-label="Service">
 			<div class="row ends">
-				<h3 id="ready-title">Service</h3>
+				<h3>Service</h3>
 				<span class=${`badge ${tone}`}>${words}</span>
 			</div>
 			${isFault
@@ -180,10 +180,9 @@ function Documents({ wantsKey }) {
 
 /** @param {{title: string, samples: Sample[] | Problem | null, Content: (props: {samples: Sample[]}) => any}} props */
 function Figures({ title, samples, Content }) {
-	const id = `${title.toLowerCase()}-title`;
 	return html`
-		<section class="card" aria-labelledby=${id}>
-			<h3 id=${id}>${title}</h3>
+		<section class="card" aria-label=${title}>
+			<h3>${title}</h3>
 			${samples === null
 				? html`<p class="hint">Asking …</p>`
 				: samples instanceof Problem
@@ -271,9 +270,9 @@ function Stages({ samples }) {
 function Model({ model, onRetry }) {
 	if (model instanceof Problem) return html`<${ProblemBox} problem=${model} onRetry=${onRetry} />`;
 	return html`
-		<section class="card" aria-labelledby="model-title">
+		<section class="card" aria-label="Model">
 			<div class="row ends">
-				<h3 id="model-title">Model</h3>
+				<h3>Model</h3>
 				${model && html`<span class="badge">${model.manifest.name}</span>`}
 			</div>
 			${model === null ? html`<p class="hint">Asking …</p>` : html`<${ModelFacts} ...${model} />`}
