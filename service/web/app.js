@@ -177,6 +177,9 @@ function App() {
 
 // what misses its place must not be opened instead of the page, which would be lost
 for (const kind of /** @type {const} */ (["dragover", "drop"])) {
-	document.addEventListener(kind, (event) => event.dataTransfer?.types.includes("Files") && event.preventDefault());
+	document.addEventListener(kind, (event) => {
+		const isAtHome = /** @type {HTMLInputElement} */ (event.target).type === "file";
+		if (!isAtHome && event.dataTransfer?.types.includes("Files")) event.preventDefault();
+	});
 }
 render(html`<${App} />`, document.body);
