@@ -8,7 +8,7 @@ import { Colours } from "./colour_controls.js";
 import { DraftForm } from "./draft_form.js";
 import { Exports } from "./exports.js";
 import { Legend } from "./legend.js";
-import { inMetres, short, toMetres, withError } from "./numbers.js";
+import { counted, inMetres, short, toMetres, withError } from "./numbers.js";
 import { PHOTOGRAPHS, mediaTypeOf, readShown } from "./photograph_files.js";
 import { ProblemBox, Warnings, useProblem } from "./problem_box.js";
 import { DepthReader } from "./reader.js";
@@ -51,7 +51,7 @@ const STEPS = {
 	receive: "Receiving the answer",
 	draw: "Drawing",
 };
-const PHOTOGRAPH_MOST_PX = 1600;
+const MOST_PX = 1600;
 const NOT_THE_FRAME = "urn:camind:problem:image-size-mismatch";
 const NO_PHOTOGRAPH = /:(invalid-image|unsupported-kind)$/;
 /** @type {Look} */
@@ -61,6 +61,7 @@ const FIRST_LOOK = { map: "cividis", nearM: 1, farM: 2, hatchesNothing: true, do
 export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, announce }) {
 	const reader = useMemo(() => new DepthReader(), []);
 	const [file, setFile] = useState(/** @type {File | null} */ (null));
+	const [leftOut, setLeftOut] = useState(0);
 	const [photograph, setPhotograph] = useState(
 		/** @type {{bitmap: ImageBitmap, width: number, height: number} | null} */ (null),
 	);
@@ -103,8 +104,11 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 		setFocusM(null);
 	}
 
-	const take = useCallback(async (/** @type {File | null | undefined} */ taken) => {
+	const take = useCallback(async (/** @type {FileList | null | undefined} */ files) => {
+		const given = Array.from(files ?? []);
+		const taken = given.find(({ type }) => type.startsWith("image/")) ?? given[0];
 		if (!taken) return;
+		setLeftOut(given.length - 1);
 		setResult(null);
 		setFailure(null);
 		setReading(null);
@@ -120,9 +124,8 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 		setFile(taken);
 		newest.current = taken;
 		const isNewest = () => newest.current === taken;
-		const mostPx = PHOTOGRAPH_MOST_PX;
-		const found = await readShown(taken, mostPx, async (shown) =>
-			isNewest() ? reader.ask("photograph", { file: shown, mostPx }).catch(() => null) : null,
+		const found = await readShown(taken, MOST_PX, async (shown) =>
+			isNewest() ? reader.ask("photograph", { file: shown, mostPx: MOST_PX }).catch(() => null) : null,
 		);
 		if (!isNewest()) return;
 		setPhotograph(found);
@@ -266,7 +269,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 					/>
 					<${Warnings} texts=${warned("focus")} />
 				</div>
-				<${FileButtons} hasFile=${file !== null} onFile=${take} />
+				<${FileButtons} hasFile=${file !== null} onFiles=${take} />
 			</div>
 
 			<${ProblemBox}
@@ -299,6 +302,10 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 			camera &&
 			html`<div class="row"><button type="button" class="primary" onClick=${again}>Read the depth</button></div>`}
 			<${Progress} phase=${phase} onCancel=${cancel} />
+			${file &&
+			html`<p class="hint" role="status">
+				${file.name}${leftOut > 0 && `, without ${counted(leftOut, "other file")}: one is read at a time`}
+			</p>`}
 
 			${size === null
 				? html`<${DropPlace} ...${{ file, isOpening }} isRefused=${failure && NO_PHOTOGRAPH.test(failure.type)} />`
@@ -359,18 +366,14 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 	`;
 }
 
-/** Photographs that are dropped anywhere on the view, or pasted. @param {boolean} shown @param {(file: File | null | undefined) => void} take */
+/** Photographs that are dropped anywhere on the view, or pasted. @param {boolean} shown @param {(files: FileList | null | undefined) => void} take */
 function useFilesFromOutside(shown, take) {
 	useEffect(() => {
 		if (!shown) return undefined;
 		const end = new AbortController();
 		const { signal } = end;
-		document.addEventListener("drop", ({ dataTransfer }) => take(dataTransfer?.files[0]), { signal });
-		document.addEventListener(
-			"paste",
-			({ clipboardData }) => take(Array.from(clipboardData?.files ?? []).find(({ type }) => type.startsWith("image/"))),
-			{ signal },
-		);
+		document.addEventListener("drop", ({ dataTransfer }) => take(dataTransfer?.files), { signal });
+		document.addEventListener("paste", ({ clipboardData }) => take(clipboardData?.files), { signal });
 		return () => end.abort();
 	}, [shown]);
 }
@@ -384,7 +387,7 @@ function DropPlace({ file, isOpening, isRefused }) {
 		onDragLeave=${() => setIsOver(false)}
 		onDrop=${() => setIsOver(false)}
 	>
-		<p><strong>${file ? file.name : "Drop a photograph here, or paste one"}</strong></p>
+		<p><strong>Drop a photograph here, or paste one</strong></p>
 		<p class="hint">
 			${file
 				? isOpening
@@ -395,12 +398,12 @@ function DropPlace({ file, isOpening, isRefused }) {
 	</div>`;
 }
 
-/** @param {{hasFile: boolean, onFile: (file: File | undefined) => void}} props */
-function FileButtons({ hasFile, onFile }) {
+/** @param {{hasFile: boolean, onFiles: (files: FileList) => void}} props */
+function FileButtons({ hasFile, onFiles }) {
 	const chosen = useRef(/** @type {HTMLInputElement | null} */ (null));
 	const taken = useRef(/** @type {HTMLInputElement | null} */ (null));
 	const onChange = (/** @type {any} */ event) => {
-		onFile(event.target.files[0]);
+		onFiles(event.target.files);
 		event.target.value = ""; // the same file may be chosen again
 	};
 	return html`<div class="row depth-files">
@@ -415,20 +418,16 @@ function FileButtons({ hasFile, onFile }) {
 
 /** @param {{picture: string, onPicture: (picture: string) => void}} props */
 function PictureTabs({ picture, onPicture }) {
-	const tabs = [
-		["photograph", "Picture"],
-		["cloud", "3D"],
-	];
 	const onKeyDown = (/** @type {KeyboardEvent} */ event) => {
 		if (!["ArrowLeft", "ArrowRight"].includes(event.key)) return;
 		event.preventDefault();
-		const [other] = /** @type {string[]} */ (tabs.find(([tab]) => tab !== picture));
+		const other = picture === "cloud" ? "photograph" : "cloud";
 		onPicture(other);
 		document.getElementById(`depth-tab-${other}`)?.focus();
 	};
 	return html`<div class="depth-tabs" role="tablist" aria-label="Views of the depth" onKeyDown=${onKeyDown}>
-		${tabs.map(
-			([tab, title]) => html`<button
+		${["photograph", "cloud"].map(
+			(tab) => html`<button
 				key=${tab}
 				type="button"
 				id=${`depth-tab-${tab}`}
@@ -438,7 +437,7 @@ function PictureTabs({ picture, onPicture }) {
 				tabindex=${tab === picture ? 0 : -1}
 				onClick=${() => onPicture(tab)}
 			>
-				${title}
+				${tab === "cloud" ? "3D" : "Picture"}
 			</button>`,
 		)}
 	</div>`;
@@ -459,7 +458,7 @@ function Progress({ phase, onCancel }) {
 	const time = "since" in phase ? ` ${((performance.now() - phase.since) / 1000).toFixed(1)} s` : "";
 	return html`<div class="depth-progress">
 		<progress key=${phase.step} aria-label="Progress" value=${fraction ?? undefined}></progress>
-		<span class="number">${STEPS[phase.step]}${part}${time}</span>
+		<span>${STEPS[phase.step]}${part}${time}</span>
 		<button type="button" onClick=${onCancel}>Cancel</button>
 	</div>`;
 }
