@@ -139,8 +139,7 @@ export function CamerasView({ shown, cameras, camera, reloadCameras, go, announc
 				</section>
 				<div class="stack">
 					${open.kind === "none" &&
-					cameras !== null &&
-					cameras.length > 0 &&
+					(cameras?.length ?? 0) > 0 &&
 					html`<p class="hint">Choose a camera to see what it can measure.</p>`}
 					${(open.kind === "new" || open.kind === "edit") &&
 					html`<${CameraForm}
@@ -183,19 +182,21 @@ function CameraCard({ camera, opened, go, onEdit, onDeleted, onStale }) {
 	const path = `cameras/${encodeURIComponent(camera.name)}`;
 	const [curve, setCurve] = useState(/** @type {any} */ (null));
 	const [problem, setProblem] = useProblem();
+	const [attempt, setAttempt] = useState(0);
 	const [isDeleting, setIsDeleting] = useState(false);
 	const { lens, intrinsics } = camera;
 	const title = useRef(/** @type {HTMLHeadingElement | null} */ (null));
 	useEffect(() => arriveAt(title.current), [opened]);
 	useEffect(() => {
 		const stop = new AbortController();
+		setProblem(null);
 		getJson(`${path}/curve`, { signal: stop.signal }).then(setCurve, (error) => stop.signal.aborted || setProblem(error));
 		return () => stop.abort();
-	}, []);
+	}, [attempt]);
 	return html`
-		<article class="card" aria-labelledby="camera-title">
+		<article class="card" aria-label=${camera.name}>
 			<div class="row ends">
-				<h3 id="camera-title" tabindex="-1" ref=${title}>${camera.name}</h3>
+				<h3 tabindex="-1" ref=${title}>${camera.name}</h3>
 				<span class="row">
 					<span class="badge">${SOURCES[camera.source]}</span>
 					<span class="badge">revision ${camera.revision}</span>
@@ -210,7 +211,7 @@ function CameraCard({ camera, opened, go, onEdit, onDeleted, onStale }) {
 				<button type="button" class="danger" onClick=${() => setIsDeleting(true)}>Delete</button>
 			</div>
 			<${CameraCurve} camera=${camera} points=${curve?.points ?? null} />
-			<${ProblemBox} problem=${problem} />
+			<${ProblemBox} problem=${problem} onRetry=${() => setAttempt(attempt + 1)} />
 			<dl class="facts">
 				<dt>Image</dt><dd>${camera.image_width_px} × ${camera.image_height_px} px</dd>
 				<dt>Focus distance</dt><dd>${short(camera.focus_distance_m, 4)} m</dd>

@@ -22,9 +22,11 @@ export function DraftForm({ file, mediaType, onStored, onFailed }) {
 	const [fields, setFields] = useState(/** @type {import("./camera_specs.js").Fields} */ ({}));
 	const [problem, setProblem] = useProblem();
 	const [isStoring, setIsStoring] = useState(false);
+	const [attempt, setAttempt] = useState(0);
 
 	useEffect(() => {
 		const abort = new AbortController();
+		setProblem(null);
 		const headers = { "Content-Type": mediaType };
 		upload("cameras/from-photo", { body: file, headers, signal: abort.signal, responseType: "json" })
 			.then(({ body }) => {
@@ -37,7 +39,7 @@ export function DraftForm({ file, mediaType, onStored, onFailed }) {
 				onFailed(error);
 			});
 		return () => abort.abort();
-	}, [file]);
+	}, [file, attempt]);
 
 	/** @param {SubmitEvent} event */
 	async function store(event) {
@@ -54,7 +56,7 @@ export function DraftForm({ file, mediaType, onStored, onFailed }) {
 	}
 
 	if (draft === null) {
-		return problem ? html`<${ProblemBox} problem=${problem} />` : html`<p class="hint">Reading the photograph's EXIF…</p>`;
+		return problem ? html`<${ProblemBox} problem=${problem} onRetry=${() => setAttempt(attempt + 1)} />` : html`<p class="hint">Reading the photograph's EXIF…</p>`;
 	}
 	const missing = missingOf(fields);
 	const faults = NUMBERS.filter(([path]) => Number.isNaN(decimal(fields[path] ?? ""))).map(([path]) => ({
