@@ -156,11 +156,14 @@ def test_a_name_that_is_taken_is_told(
 ) -> None:
     expected_errors.append("status of 409")
     served.add(phone)
+    page.set_viewport_size({"width": 360, "height": 740})
     page.goto("#cameras")
     page.get_by_role("button", name="New camera").click()
     page.get_by_label("k_cam", exact=True).check()
     fill(page, FRAME | {"Name": phone["name"], "k_cam (px)": "2"})
-    page.get_by_role("button", name="Create camera").click()
+    page.get_by_role("button", name="Create camera").press("Enter")
+    expect(page.get_by_role("alert").locator("strong")).to_be_in_viewport()
+    expect(page.locator(":focus").get_by_role("alert")).to_be_visible()
     expect(page.get_by_label("Name", exact=True)).to_have_accessible_description(
         "This name is taken: open that camera to change it."
     )
@@ -193,6 +196,32 @@ def test_another_s_change_is_shown_and_one_chooses(
         page.get_by_role("button", name="Save as a new revision").click()
         expect(page.get_by_text("revision 3").first).to_be_visible()
         assert read(served, phone["name"])["k_cam_px"] == 1.7
+
+
+def test_a_camera_that_was_deleted_meanwhile_is_stored_anew(
+    page: Page, served: Server, phone: dict[str, Any], expected_errors: list[str]
+) -> None:
+    expected_errors.append("status of 404")
+    open_camera(page, served, phone)
+    page.get_by_role("button", name="Edit").click()
+    fill(page, {"k_cam (px)": "1,7"})
+    served.ask("DELETE", f"/cameras/{phone['name']}")
+    page.get_by_role("button", name="Save as a new revision").click()
+    expect(page.get_by_role("alert")).to_contain_text("There is no camera")
+    page.get_by_role("button", name="Create camera").click()
+    expect(page.get_by_role("article")).to_contain_text("1.7 px")
+    assert read(served, phone["name"])["k_cam_px"] == 1.7
+
+
+def test_a_curve_that_did_not_come_can_be_asked_for_again(
+    page: Page, served: Server, phone: dict[str, Any], expected_errors: list[str]
+) -> None:
+    expected_errors.append("ERR_FAILED")
+    page.route("**/curve", lambda route: route.abort(), times=1)
+    open_camera(page, served, phone)
+    page.get_by_role("article").get_by_role("button", name="Try again").click()
+    expect(page.get_by_role("img", name="Blur against distance")).to_be_visible()
+    expect(page.get_by_role("alert").filter(visible=True)).to_have_count(0)
 
 
 @pytest.mark.parametrize(
@@ -395,6 +424,17 @@ def test_what_is_typed_is_not_thrown_away_unasked(page: Page, served: Server, ph
     page.get_by_role("button", name=other).click()
     eventually(page, lambda: asked == ["Throw away what you have typed?"] and page.url.endswith(f"/{phone['name']}"))
     expect(focus).to_have_value("1,23")
+    leaving: list[str] = []
+
+    def leave(dialog: Dialog) -> None:
+        leaving.append(dialog.type)
+        dialog.accept()
+
+    page.once("dialog", leave)
+    page.reload()
+    assert leaving == ["beforeunload"]
+    page.get_by_role("button", name="Edit", exact=True).click()
+    focus.fill("1,23")
     page.once("dialog", lambda dialog: dialog.accept())
     page.get_by_role("button", name=other).click()
     expect(page.get_by_role("heading", name=other, exact=True)).to_be_visible()
@@ -402,6 +442,9 @@ def test_what_is_typed_is_not_thrown_away_unasked(page: Page, served: Server, ph
     page.get_by_role("button", name="Edit", exact=True).click()
     page.get_by_role("button", name=phone["name"]).first.click()
     expect(page.get_by_role("heading", name=phone["name"], exact=True)).to_be_visible()
+    page.once("dialog", leave)
+    page.reload()
+    assert leaving == ["beforeunload"]
 
 
 def test_a_range_ends_where_answers_end(page: Page, served: Server, phone: dict[str, Any]) -> None:

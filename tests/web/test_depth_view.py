@@ -43,6 +43,28 @@ GIVE = """(place, {bytes, name, kind}) => {
     : new DragEvent(kind, {dataTransfer: given, bubbles: true, cancelable: true});
   place.dispatchEvent(made);
 }"""
+GIVE_MORE = """(place, bytes) => {
+  const given = new DataTransfer();
+  given.items.add(new File(["%PDF"], "notes.pdf", {type: "application/pdf"}));
+  const content = Uint8Array.from(atob(bytes), (letter) => letter.charCodeAt(0));
+  given.items.add(new File([content], "photo.jpg", {type: "image/jpeg"}));
+  place.dispatchEvent(new DragEvent("drop", {dataTransfer: given, bubbles: true, cancelable: true}));
+}"""
+# while it waits for its answer
+ROOM = """(bar) => new Promise((done) => {
+  const look = () => {
+    const [, words, button] = bar.parentElement.children;
+    if (!words.textContent.startsWith("Waiting for a slot")) return requestAnimationFrame(look);
+    const text = document.createRange();
+    text.selectNodeContents(words);
+    done({
+      bar: bar.parentElement.firstChild.clientWidth,
+      words: text.getBoundingClientRect().right,
+      button: button.getBoundingClientRect().left,
+    });
+  };
+  look();
+})"""
 PICTURE_COLOURS = """(canvas) => {
   const {width, height} = canvas;
   const copy = new OffscreenCanvas(width, height).getContext("2d");
@@ -535,6 +557,36 @@ def test_a_camera_that_was_changed_elsewhere_is_told_by_its_new_numbers(
         served.ask("DELETE", f"/cameras/{name}")
     opened.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
     expect(opened.get_by_text("There is no camera changing.")).to_be_visible()
+
+
+def test_of_several_files_one_photograph_is_read_and_named(opened: Page) -> None:
+    choose(opened)
+    opened.locator(".depth").evaluate(GIVE_MORE, base64.b64encode(PHOTOGRAPH.read_bytes()).decode())
+    expect(opened.get_by_text("photo.jpg, without 1 other file")).to_be_visible()
+    stage(opened)
+
+
+def test_a_file_that_was_changed_since_it_was_chosen_is_told(
+    opened: Page, tmp_path: Path, expected_errors: list[str]
+) -> None:
+    expected_errors.append("ERR_UPLOAD_FILE_CHANGED")
+    file = tmp_path / "photo.jpg"
+    file.write_bytes(PHOTOGRAPH.read_bytes())
+    choose(opened)
+    opened.locator("input[type=file]:not([capture])").first.set_input_files(file)
+    stage(opened)
+    file.write_bytes(b"another")
+    opened.get_by_role("button", name="Download").click()
+    expect(opened.get_by_role("alert").filter(visible=True)).to_contain_text("The browser cannot read the file.")
+
+
+def test_progress_has_room_on_a_phone(opened: Page) -> None:
+    opened.set_viewport_size({"width": 360, "height": 740})
+    choose(opened)
+    give(opened)
+    room = opened.get_by_role("progressbar").evaluate(ROOM)
+    assert room["bar"] > 40
+    assert room["words"] <= room["button"]
 
 
 def test_what_is_no_photograph_is_not_said_to_be_readable(opened: Page, expected_errors: list[str]) -> None:

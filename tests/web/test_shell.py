@@ -25,6 +25,9 @@ ROOT = Path(__file__).parents[2]
 TABS = ("depth", "cameras", "calibrate", "status")
 QUOTA = 40
 REFUSED = "status of 401"
+NO_STORAGE = """Object.defineProperty(window, "sessionStorage", {
+  get() { throw new DOMException("The operation is insecure.", "SecurityError"); },
+});"""
 LINE_COLOUR = "(element) => getComputedStyle(element).borderBottomColor"
 
 
@@ -164,6 +167,15 @@ def test_a_key_is_asked_for_once_and_kept_for_the_tab(browser: Browser, keyed: K
         expect(another.get_by_role("dialog", name="API key")).to_be_visible()
         page.get_by_role("button", name="Forget API key").click()
         expect(dialog).to_be_visible()
+
+
+def test_a_browser_that_stores_nothing_holds_the_key_until_the_page_is_left(browser: Browser, keyed: Keyed) -> None:
+    with watched(browser, keyed.server.url, [REFUSED]) as page:
+        page.add_init_script(NO_STORAGE)
+        page.goto("#cameras")
+        give_key(page, keyed.key())
+        expect(page.get_by_role("button", name="Forget API key")).to_be_visible()
+        expect(page.get_by_text("There is no camera yet.")).to_be_visible()
 
 
 def test_without_a_key_the_page_says_what_it_lacks(
