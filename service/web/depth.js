@@ -303,7 +303,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 			html`<div class="row"><button type="button" class="primary" onClick=${again}>Read the depth</button></div>`}
 			<${Progress} phase=${phase} onCancel=${cancel} />
 			${file &&
-			html`<p class="hint" role="status">
+			html`<p class="hint">
 				${file.name}${leftOut > 0 && `, without ${counted(leftOut, "other file")}: one is read at a time`}
 			</p>`}
 
