@@ -24,6 +24,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from model_export.datasets.photos import Photo, Shot, save_photos
 from model_export.render import DISC, blur
 from service.cores import available_cores
 from service.optics import thin_lens
@@ -39,7 +40,6 @@ EDGE_EXCESS = 0.5
 EDGE_OVERSAMPLE = 8
 EDGE_TOLERANCE = 0.03
 GAMMA_PX = 0.5
-MILLIMETRES = 1000.0
 
 Map = NDArray[np.float32]
 Item = TypeVar("Item")
@@ -219,27 +219,21 @@ def compare_edges(rendered: Path, scenes: list[Scene]) -> Iterator[EdgeResult]:
 
 
 def develop(rendered: Path, scenes: list[Scene], out: Path) -> None:
-    """Rendered rooms as an evaluation set: ``color/``, ``depth/`` (16-bit millimetres) and ``cameras.json``.
+    """Rendered rooms as an evaluation set: gamma is brought to 0.5 px, brightness to the 98th percentile."""
+    save_photos(out, (_developed(rendered, scene) for scene in scenes))
 
-    gamma is brought to 0.5 px, brightness to the 98th percentile; depth beyond 65 m is unknown.
-    """
-    for part in ("color", "depth"):
-        (out / part).mkdir(parents=True, exist_ok=True)
-    cameras = {}
-    for scene in scenes:
-        found = np.load(rendered / f"{scene.name}.npz")
-        light = torch.from_numpy(found["light"].transpose(2, 0, 1).copy())
-        margin = 8
-        padded = torch.nn.functional.pad(light[None], (margin,) * 4, mode="reflect")[0]
-        soft = blur(padded, math.sqrt(GAMMA_PX**2 - thin_lens.PIXEL_BOX_VARIANCE))[:, margin:-margin, margin:-margin]
-        picture = encode_srgb((soft / soft.quantile(0.98).clamp_min(1e-3)).permute(1, 2, 0).numpy())
-        depth_mm = np.where(found["depth_m"] < 65, found["depth_m"] * MILLIMETRES, 0)
-        cv2.imwrite(str(out / "color" / f"{scene.name}.png"), np.rint(picture[:, :, ::-1] * 255).astype(np.uint8))
-        cv2.imwrite(str(out / "depth" / f"{scene.name}.png"), np.rint(depth_mm).astype(np.uint16))
-        cameras[scene.name] = {
-            "focus_distance_m": scene.focus_distance_m,
-            "k_cam_px": scene.k_cam_px,
-            "gamma_px": GAMMA_PX,
-            "fx_px": scene.fx_px,
-        }
-    (out / "cameras.json").write_text(json.dumps(cameras, indent=1) + "\n")
+
+def _developed(rendered: Path, scene: Scene) -> Shot:
+    found = np.load(rendered / f"{scene.name}.npz")
+    light = torch.from_numpy(found["light"].transpose(2, 0, 1).copy())
+    margin = 8
+    padded = torch.nn.functional.pad(light[None], (margin,) * 4, mode="reflect")[0]
+    soft = blur(padded, math.sqrt(GAMMA_PX**2 - thin_lens.PIXEL_BOX_VARIANCE))[:, margin:-margin, margin:-margin]
+    picture = encode_srgb((soft / soft.quantile(0.98).clamp_min(1e-3)).permute(1, 2, 0).numpy())
+    camera = {
+        "focus_distance_m": scene.focus_distance_m,
+        "k_cam_px": scene.k_cam_px,
+        "gamma_px": GAMMA_PX,
+        "fx_px": scene.fx_px,
+    }
+    return Photo(scene.name, np.rint(picture * 255).astype(np.uint8), found["depth_m"]), camera

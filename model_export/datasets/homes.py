@@ -15,7 +15,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from model_export.datasets.blender import MILLIMETRES, run_workers, shares
+from model_export.datasets.blender import run_workers, shares
+from model_export.datasets.photos import CAMERAS, write_depth, write_image
 from model_export.textures import picture_files
 from service.optics.light import encode_srgb
 
@@ -29,8 +30,6 @@ VIEWS = 8
 SIZE_PX = (400, 300)
 SAMPLES = 8
 WHITE_SHARE, DARKEST = 0.98, 1e-2
-FARTHEST_M = 65.0
-CAMERAS = "cameras.json"
 LICENCES = """- rooms furnished from Sweet Home 3D's libraries: BlendSwap CC-0 (CC0), BlendSwap CC-BY (its contributors,
   CC BY 3.0), KatorLegaz (Andrew Kator and Jennifer Legaz, CC BY 3.0), Reallusion (CC BY 3.0), Scopia (CC BY 3.0);
   rendered with Blender, some pieces painted anew.
@@ -147,7 +146,6 @@ def _developed(rendered: Path, out: Path) -> dict[str, float] | None:
     if not white > DARKEST:
         return None
     picture = np.rint(encode_srgb(np.clip(light / white, 0, 1)) * 255).astype(np.uint8)
-    depth_mm = np.where(found["depth_m"] < FARTHEST_M, found["depth_m"] * MILLIMETRES, 0)
-    cv2.imwrite(str(out / "color" / f"{rendered.stem}.jpg"), picture[:, :, ::-1], ENCODING)
-    cv2.imwrite(str(out / "depth" / f"{rendered.stem}.png"), np.rint(depth_mm).astype(np.uint16))
+    write_image(out / "color" / f"{rendered.stem}.jpg", picture, ENCODING)
+    write_depth(out / "depth" / f"{rendered.stem}.png", found["depth_m"])
     return {"fx_px": float(found["focal_length_px"])}

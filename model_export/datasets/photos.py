@@ -1,6 +1,7 @@
 """Photographs with depth: a folder with ``color/`` and ``depth/`` files of the same stem."""
 
-from collections.abc import Iterator
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 MILLIMETRE_M = np.float32(1e-3)
+MILLIMETRES = 1000.0
+FARTHEST_M = 65.0  # what 16 bits of millimetres hold
+CAMERAS = "cameras.json"
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,6 +22,9 @@ class Photo:
     name: str
     image: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
+
+
+Shot = tuple[Photo, Mapping[str, float]]  # and what is known of its camera, by the names of cameras.json
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
@@ -37,12 +44,48 @@ def read_depth(path: Path) -> NDArray[np.float32]:
 
 
 def load_photos(folder: Path, every: int = 1) -> Iterator[Photo]:
-    """Each ``every``-th pair of the folder in order of names; raises if there is none."""
+    """Each ``every``-th pair of the folder in order of names; raises if there is none, or for depth of another size."""
     files = sorted((folder / "color").glob("*"))[::every]
     if not files:
         raise FileNotFoundError(f"no pictures in {folder / 'color'}")
     for file in files:
-        yield Photo(file.stem, read_image(file), read_depth(folder / "depth" / f"{file.stem}.png"))
+        depth_file = folder / "depth" / f"{file.stem}.png"
+        photo = Photo(file.stem, read_image(file), read_depth(depth_file))
+        (height, width), (rows, columns) = photo.image.shape[:2], photo.depth_m.shape
+        if (height, width) != (rows, columns):
+            raise ValueError(f"{depth_file} has {columns}x{rows} pixels, its picture {width}x{height}")
+        yield photo
+
+
+def save_photos(folder: Path, shots: Iterable[Shot]) -> int:
+    """Write pictures as a set, or into one: ``color/``, ``depth/`` and, last, ``cameras.json``; how many there were."""
+    for part in ("color", "depth"):
+        (folder / part).mkdir(parents=True, exist_ok=True)
+    cameras = {}
+    for photo, camera in shots:
+        write_image(folder / "color" / f"{photo.name}.png", photo.image)
+        write_depth(folder / "depth" / f"{photo.name}.png", photo.depth_m)
+        cameras[photo.name] = dict(camera)
+    file = folder / CAMERAS
+    others = json.loads(file.read_text()) if file.exists() else {}
+    file.write_text(json.dumps(others | cameras, indent=1) + "\n")
+    return len(cameras)
+
+
+def write_image(file: Path, image: NDArray[np.uint8], options: Sequence[int] = ()) -> None:
+    """An RGB picture [h,w,3] as a file of the kind that its name says, with OpenCV's options."""
+    _write(file, image[:, :, ::-1], options)
+
+
+def write_depth(file: Path, depth_m: NDArray[np.float32]) -> None:
+    """A map [h,w] in metres as a 16-bit PNG in millimetres: 0 where it is unknown, or beyond 65 m."""
+    depth_mm = np.where(depth_m < FARTHEST_M, depth_m * MILLIMETRES, 0)
+    _write(file, np.rint(depth_mm).astype(np.uint16))
+
+
+def _write(file: Path, pixels: NDArray[np.uint8] | NDArray[np.uint16], options: Sequence[int] = ()) -> None:
+    # cv2.imwrite says nothing of a full disk
+    file.write_bytes(cv2.imencode(file.suffix, pixels, options)[1].tobytes())
 
 
 def filled(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
