@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from model_export.datasets.photos import read_image
+
 OVERSAMPLE = 2
 KIND_SHARES = {
     "photo": 0.33,
@@ -39,9 +41,8 @@ def picture_files(folder: Path) -> list[Path]:
 
 
 def load_photographs(folder: Path) -> list[NDArray[np.uint8]]:
-    """All JPEG and PNG files below ``folder``, RGB, in a fixed order. Raises if there is none."""
-    images = [cv2.imread(str(path), cv2.IMREAD_COLOR) for path in picture_files(folder)]
-    photographs = [np.ascontiguousarray(image[:, :, ::-1], np.uint8) for image in images if image is not None]
+    """All JPEG and PNG files below ``folder``, RGB, in a fixed order. Raises if there is none, or one is no picture."""
+    photographs = [read_image(path) for path in picture_files(folder)]
     if not photographs:
         raise FileNotFoundError(f"no JPEG or PNG pictures below {folder}")
     return photographs

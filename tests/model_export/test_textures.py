@@ -1,11 +1,14 @@
 """Textures: every kind is as sharp as pixels allow, and what is plain is as soft as the light upon it."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from model_export import textures
-from model_export.textures import KIND_SHARES, PATTERNS, draw_texture, plain_texture
+from model_export.datasets.photos import write_image
+from model_export.textures import KIND_SHARES, PATTERNS, draw_texture, load_photographs, plain_texture
 
 SIZE = 128
 PHOTOGRAPH = np.random.default_rng(0).integers(0, 256, (300, 400, 3)).astype(np.uint8)
@@ -53,3 +56,11 @@ def test_what_is_plain_has_no_edge() -> None:
     for seed in range(12):
         texture = plain_texture(np.random.default_rng(seed), np.array([0.5, 0.4, 0.3], np.float32), SIZE)
         assert largest_step(texture) < 0.1
+
+
+def test_a_file_that_is_no_picture_is_named(tmp_path: Path) -> None:
+    write_image(tmp_path / "good.png", PHOTOGRAPH)
+    assert len(load_photographs(tmp_path)) == 1
+    (tmp_path / "bad.png").write_bytes(b"no picture")
+    with pytest.raises(ValueError, match=r"bad\.png is no picture"):
+        load_photographs(tmp_path)
