@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_export.config import SceneConfig
-from model_export.datasets.photos import Photo, filled, load_photos
+from model_export.datasets.photos import CAMERAS, Photo, filled, load_photos
 from model_export.render import refocus
 from model_export.scenes import draw_sample, draw_shot, true_blur_px
 from model_export.train import HELD_OUT_SEED
@@ -43,6 +43,8 @@ SIDES: dict[int, Side] = {-1: "near", 0: "auto", 1: "far"}
 FIXED = "fixed"
 SETS = ("rgbd", "tabletop", "d200", "blender")  # a folder of data each
 FIXED_SCENES = 6
+TAKEN = (FIXED, "plane", "procedural", "indoor")  # what names of sets that are no folder begin with
+CAMERA_NAMES = ("focus_distance_m", "k_cam_px", "gamma_px")  # without which no picture can be answered
 ORACLE_FACTORS = (0.8, 0.9, 1.0, 1.1, 1.25, 1.4)
 MISFOCUSED = ("focus -10%", "focus +10%")
 KNOWN_DEPTHS = ", known depths"  # after the name of another mode: three depths of each picture are known besides
@@ -223,15 +225,15 @@ def fixed_cases() -> Iterator[Case]:
         yield from procedural_cases(FIXED_SCENES, side)
 
 
-def blender_cases(folder: Path, count: int) -> Iterator[Case]:
-    """Ray-traced thin-lens scenes of ``camind blender``; the side is not told."""
-    cameras = json.loads((folder / "cameras.json").read_text())
+def photographed_cases(folder: Path, count: int) -> Iterator[Case]:
+    """Pictures out of focus, each with a camera in ``cameras.json``, as of ``camind blender``; the side is not told."""
+    cameras = json.loads((folder / CAMERAS).read_text())
     for photo in _spread(folder, count):
         height, width = photo.image.shape[:2]
-        if photo.name not in cameras:
-            raise ValueError(f"{folder / 'cameras.json'} has no {photo.name}, which {folder / 'color'} has")
-        told = cameras[photo.name]
-        inner = Intrinsics.centred(told["fx_px"], width, height)
+        told = cameras.get(photo.name, {})
+        if lacking := [name for name in CAMERA_NAMES if name not in told]:
+            raise ValueError(f"{folder / CAMERAS} has no {lacking[0]} of {photo.name}, which {folder / 'color'} has")
+        inner = Intrinsics.centred(told["fx_px"], width, height) if "fx_px" in told else None
         camera = Camera(width, height, told["focus_distance_m"], told["k_cam_px"], told["gamma_px"], intrinsics=inner)
         blur_px = thin_lens.blur_at_depth(photo.depth_m, camera.focus_distance_m, camera.k_cam_px, camera.gamma_px)
         yield Case(photo.name, photo.image, photo.depth_m, camera, "auto", blur_px)
@@ -281,7 +283,9 @@ def trials(data: Path, quick: bool) -> list[Trial]:
         _trial(f"procedural {n}", partial(procedural_cases, scenes, side)) for n, side in PROCEDURAL_SIDES.items()
     ]
     if "blender" in there:
-        found.append(_trial("blender", partial(blender_cases, there["blender"], 2 * scenes), "right side"))
+        found.append(_trial("blender", partial(photographed_cases, there["blender"], 2 * scenes), "right side"))
+    for folder in photographed_folders(data):
+        found.append(_trial(folder.name, partial(photographed_cases, folder, 2 * scenes), "right side"))
     for folder in indoor:
         found += _indoor_trials(folder, quick)
     if "d200" in there:
@@ -290,6 +294,14 @@ def trials(data: Path, quick: bool) -> list[Trial]:
         further = ("right side", *told, "gt" + KNOWN_DEPTHS, MISFOCUSED[1] + KNOWN_DEPTHS)
         found.append(replace(_trial("d200", source, *further), factors=ORACLE_FACTORS))
     return found
+
+
+def photographed_folders(data: Path) -> list[Path]:
+    """Those of a data folder that have a name of their own and cameras of their pictures."""
+    folders = sorted(file.parent for file in data.glob(f"*/{CAMERAS}") if file.parent.name not in SETS)
+    if taken := [folder for folder in folders if folder.name.split()[0] in TAKEN]:
+        raise ValueError(f"{taken[0]} has the name of another set: name it otherwise")
+    return folders
 
 
 def _trial(name: str, source: CaseSource, *further_modes: str) -> Trial:

@@ -1,4 +1,4 @@
-"""What training adds to ``camind``: train, narrow, average, export, verify, evaluate, bench, blender, homes."""
+"""What training adds to ``camind``: train, narrow, average, export, verify, evaluate, bench, blender, homes, data."""
 
 import json
 import shutil
@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -44,6 +44,7 @@ Threads = Annotated[
         show_default="those that workers leave",
     ),
 ]
+Layout = Literal["defocusnet", "ddff12", "nyu"]
 Checkpoint = Annotated[Path, typer.Option(help="checkpoint file of a run, or a model folder", exists=True)]
 
 BLENDER_ENVIRONMENT = Path(".venv-blender")
@@ -248,7 +249,11 @@ def _differences(differences: "list[Difference]") -> Table:
 @commands.command()
 def evaluate(
     data: Annotated[
-        Path, typer.Option(help="folder with rgbd/, tabletop/, d200/, blender/ (what is there is used)", exists=True)
+        Path,
+        typer.Option(
+            help="folder with rgbd/, tabletop/, d200/, blender/, or any with cameras.json (what is there is used)",
+            exists=True,
+        ),
     ],
     model: Model = DEFAULT_MODEL,
     beside: Annotated[
@@ -274,7 +279,7 @@ def evaluate(
             load_model_folder(folder)
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
-    sets = trials(data, quick)
+        sets = trials(data, quick)
     if missing := [name for name in SETS if not any(trial.name.startswith(name) for trial in sets)]:
         typer.secho(f"{data} has no pictures of {', '.join(missing)}: without them", err=True)
     with progress_bar(Console(stderr=True)) as progress, _plain_failures():
@@ -417,3 +422,20 @@ def homes(
     except (FileNotFoundError, RuntimeError) as exc:
         raise _fail(str(exc)) from exc
     typer.echo(out)
+
+
+@commands.command()
+def data(
+    layout: Annotated[Layout, typer.Argument(help="whose files they are")],
+    source: Annotated[Path, typer.Argument(help="folder of DefocusNet's, or the .h5 or .mat file", exists=True)],
+    out: Annotated[Path, typer.Option(help="folder of the set, e.g. DATA/ddff12", file_okay=False)],
+) -> None:
+    """Turn a dataset of the literature into a folder that evaluate scores: color/, depth/, cameras.json."""
+    with _training_parts():
+        from model_export.datasets import ddff12, defocusnet, nyu
+        from model_export.datasets.photos import save_photos
+
+    shots = {"defocusnet": defocusnet.shots, "ddff12": ddff12.shots, "nyu": nyu.shots}[layout]
+    with progress_bar(Console(stderr=True)) as progress, _plain_failures():
+        written = save_photos(out, progress.track(shots(source), total=None, description=layout))
+    typer.echo(f"{out}: {written} pictures")

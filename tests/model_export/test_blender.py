@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from model_export.cases import blender_cases
+from model_export.cases import photographed_cases
 from model_export.datasets.blender import (
     EDGE_TOLERANCE,
     GAMMA_PX,
@@ -62,7 +62,7 @@ def test_rooms_become_a_set_with_their_cameras(tmp_path: Path) -> None:
         light = np.repeat(sharp_edge(64)[..., None], 3, axis=2)
         np.savez(tmp_path / "raw" / f"{scene.name}.npz", light=light, depth_m=depth_m)
     develop(tmp_path / "raw", scenes, tmp_path)
-    found = list(blender_cases(tmp_path, 2))
+    found = list(photographed_cases(tmp_path, 2))
     assert [case.name for case in found] == [scene.name for scene in scenes]
     for case, scene in zip(found, scenes, strict=True):
         assert case.camera.gamma_px == GAMMA_PX
