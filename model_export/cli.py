@@ -287,6 +287,8 @@ def evaluate(
         found = run_evaluation(
             models, sets, lambda said, finished: progress.update(task, description=said, advance=finished)
         )
+    if empty := {trial.name for trial in sets} - {found_of.name for found_of in found[0].sets}:
+        typer.secho(f"no picture with enough depth to score: without {', '.join(sorted(empty))}", err=True)
     tables = reports.tables(found[0])
     if beside is not None:
         tables |= {f"{found[1].model} beside {found[0].model}": reports.beside(*found)}

@@ -370,6 +370,9 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("data")
     write_photo(folder / "rgbd", "one", 900)
     write_photo(folder / "tabletop", "two", 700)
+    write_photo(folder / "desk", "three", 0)  # no depth is known
+    camera = {"focus_distance_m": 2.0, "k_cam_px": 3.0, "gamma_px": 0.5}
+    (folder / "desk" / "cameras.json").write_text(json.dumps({"three": camera}))
     return folder
 
 
@@ -381,6 +384,7 @@ def test_the_command_prints_and_writes_what_it_found(data: Path, tiny_model_dir:
     assert result.exit_code == 0, result.output
     for said in ("rgbd k_cam 3.81", "k_cam -10%", "tabletop shuffled", "procedural mixed", "worst", "report.html"):
         assert said in result.output
+    assert "without desk" in result.output
     assert json.loads((out / "beside" / "report.json").read_text()) == json.loads((out / "report.json").read_text())
     report = json.loads((out / "report.json").read_text())
     sets = {(s["name"], s["mode"]): s for s in report["sets"]}
