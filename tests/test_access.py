@@ -24,7 +24,7 @@ from service.principal import SCOPES, Scope
 from service.storage.keys import Keys
 from tests.fake_calibration import SETTINGS, FakeCalibration
 from tests.inference.photographs import corners, png
-from tests.test_cli import camind
+from tests.test_cli import at_once, camind
 
 PROBLEM = "application/problem+json"
 NOWHERE = "/no-such-thing"
@@ -367,22 +367,23 @@ def test_keys_are_found_named_and_revoked(engine: Engine) -> None:
         keys.create("a b", "lab")
 
 
-def test_keys_from_the_command_line(tmp_path: Path) -> None:
-    made = camind(tmp_path, "keys", "create", "robot", "--scope", "depth", "--days", "2")
-    assert made.returncode == 0, made.stderr
+def test_keys_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CAMIND_DATA_DIR", str(tmp_path))
+    made = at_once("keys", "create", "robot", "--scope", "depth", "--days", "2")
+    assert made.exit_code == 0, made.stderr
     text = made.stdout.strip()
-    listed = camind(tmp_path, "keys", "list").stdout
+    listed = at_once("keys", "list").stdout
     key_id, name, owner, scopes, state, *_ = listed.strip().split("\t")
     assert (name, owner, scopes, state) == ("robot", "robot", "depth", "good")
     product, named, secret = text.split("_", maxsplit=2)
     assert (product, named) == ("camind", key_id)
     assert len(secret) >= 32
     assert secret not in listed
-    assert camind(tmp_path, "keys", "revoke", key_id).returncode == 0
-    assert "\trevoked\t" in camind(tmp_path, "keys", "list").stdout
-    wrong = camind(tmp_path, "keys", "create", "robot", "--scope", "all")
-    assert (wrong.returncode, wrong.stdout) == (2, "")
-    assert camind(tmp_path, "keys", "revoke", "nobody").returncode == 1
+    assert at_once("keys", "revoke", key_id).exit_code == 0
+    assert "\trevoked\t" in at_once("keys", "list").stdout
+    wrong = at_once("keys", "create", "robot", "--scope", "all")
+    assert (wrong.exit_code, wrong.stdout) == (2, "")
+    assert at_once("keys", "revoke", "nobody").exit_code == 1
 
 
 def test_the_log_names_the_key_but_not_its_secret(tmp_path: Path, tiny_model_dir: Path) -> None:
