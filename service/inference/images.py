@@ -39,7 +39,7 @@ UNDECLARED = frozenset({"", "application/octet-stream", "image/*"})
 
 # how files of these kinds end
 SUFFIXES = frozenset(
-    {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic", ".heif", ".dng", ".cr2", ".nef", ".arw"}
+    {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic", ".heif", ".hif", ".dng", ".cr2", ".nef", ".arw"}
 )
 
 # (transposed, flipped left-right, flipped top-bottom), in this order, by EXIF orientation

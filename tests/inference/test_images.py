@@ -6,6 +6,7 @@ import time
 import zlib
 from collections.abc import Callable
 from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from PIL import Image
 from service.errors import InvalidImage, TooLarge, UnsupportedKind
 from service.inference.exif import Exif, read_exif
 from service.inference.headers import MOST_PARTS, MOST_SCANS, read_header
-from service.inference.images import TURNS, ImageLimits, read_photograph, read_stored_frame
+from service.inference.images import TURNS, ImageLimits, photographs_in, read_photograph, read_stored_frame
 from service.opencv import cv2
 from tests.inference.photographs import (
     ExifValue,
@@ -338,6 +339,12 @@ def test_a_png_s_number_of_its_curve_counts_before_its_profile() -> None:
         assert read_header(data[:33] + coded + profile + data[33:]).other_curve == curve
     for damaged in (b"", b"x", b"x\0\0", b"x\0\0abc"):
         assert read_header(data[:33] + png_chunk(b"iCCP", damaged) + data[33:]).other_curve is None
+
+
+def test_photographs_of_a_folder_are_known_by_how_cameras_name_them(tmp_path: Path) -> None:
+    for name in ("b.HIF", "a.JPG", "c.heic", "d.NEF", "e.txt", "f.mov"):
+        (tmp_path / name).touch()
+    assert [path.name for path in photographs_in(tmp_path)] == ["a.JPG", "b.HIF", "c.heic", "d.NEF"]
 
 
 def pages(*subfiles: int) -> bytes:
