@@ -120,7 +120,9 @@ class Authenticate:
             raise UnknownHost("The service is not known by this name: add it to CAMIND_HOSTS, or serve with API keys.")
         is_allowed = headers.get("origin") in self._origins
         if scope["method"] not in READING and not is_allowed and is_from_another_site(headers):
-            raise CrossOrigin("A page of another site asked for this; only the service's own page may.")
+            raise CrossOrigin(
+                "This was sent by another site's page: only the service's own page, and those of CAMIND_ORIGINS, may."
+            )
 
     async def _principal(self, scope: Scope) -> Principal:
         headers = Headers(scope=scope)
@@ -132,11 +134,11 @@ class Authenticate:
             raise Unauthorized("Send an API key: Authorization: Bearer camind_...")
         key = await run_in_threadpool(keys.find, text.strip())
         if key is None:
-            raise Unauthorized("This API key is unknown, revoked or expired.")
+            raise Unauthorized("This API key is unknown, revoked or expired: ask the operator for another.")
         self._count(key)
         needed = needed_scope(scope["method"], scope["path"])
         if needed is not None and needed not in key.scopes:
-            raise Forbidden(f"This API key lacks the scope {needed}.", scope=needed)
+            raise Forbidden(f"This API key lacks the scope {needed}: use one that has it.", scope=needed)
         return Principal(key.owner, key.id)
 
     def _count(self, key: ApiKey) -> None:
@@ -150,7 +152,7 @@ class Authenticate:
             return
         wait_s = self._limiter.get_window_stats(self._quota, key.id).reset_time - time.time()
         raise QuotaExceeded(
-            f"This API key has had its {self._quota.amount} requests of this minute.",
+            f"This API key has used its {self._quota.amount} requests of this minute: wait the seconds of Retry-After.",
             retry_after_s=max(1, math.ceil(wait_s)),
         )
 

@@ -324,7 +324,7 @@ def add_camera(
         except ValidationError as exc:
             raise _failure(str(invalid_model(exc, "body")), WRONG_USE) from exc
         except ValueError as exc:
-            raise _failure(f"This is no JSON: {exc}", WRONG_USE) from exc
+            raise _failure(f"This is not valid JSON: {exc}", WRONG_USE) from exc
         draft = body.to_draft(body.name)
         with _ready_engine() as engine:
             cameras = Cameras(engine, owner)

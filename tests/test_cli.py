@@ -227,7 +227,7 @@ def at_once(*arguments: str, said: str = "") -> Result:
 @pytest.mark.parametrize(
     ("specs", "code", "said"),
     [
-        ("x", 2, "This is no JSON: "),
+        ("x", 2, "This is not valid JSON: "),
         ("[]", 2, "JSON object"),
         (json.dumps({**BENCH, "focus_distance_m": -2}), 2, "focus_distance_m: "),
         (json.dumps({**BENCH, "name": "half", "description": "\ud800"}), 2, "description: "),

@@ -290,7 +290,7 @@ def pixel_at(u: float, v: float, part: Part, asked_in: str = "at") -> tuple[int,
     row, column = math.floor(v + 0.5) - part.top, math.floor(u + 0.5) - part.left
     if not (0 <= row < part.height_px and 0 <= column < part.width_px):
         asked = f"({part.left}, {part.top}) to ({part.right}, {part.bottom})"
-        detail = f"({u:g}, {v:g}) lies outside what is asked for of the upright photograph, {asked}."
+        detail = f"({u:g}, {v:g}) is outside the part of the upright photograph that is asked for, {asked}."
         raise BadRequest.at(detail, asked_in)
     return row, column
 

@@ -95,7 +95,9 @@ def read_header(data: bytes) -> Header:
         raise InvalidImage("The file is empty: send the bytes of one photograph.")
     kind = sniff(data)
     if kind is None:
-        raise UnsupportedKind("The bytes are none of JPEG, PNG, TIFF, WebP, HEIC and DNG.")
+        raise UnsupportedKind(
+            "This is not a JPEG, PNG, TIFF, WebP, HEIC or DNG file: send a photograph of one of these kinds."
+        )
     try:
         header = PARSERS[kind](data)
     except (struct.error, IndexError) as exc:

@@ -149,7 +149,7 @@ def declared_kind(media_type: str | None) -> Kind | None:
         raise UnsupportedKind(f"{name} is what curl says of any body: add -H 'Content-Type: image/jpeg'.")
     kind = MEDIA_TYPES.get(name) or ALIASES.get(name)
     if kind is None:
-        raise UnsupportedKind(f"{name[:100]} is no photograph: send one of {', '.join(MEDIA_TYPES)}.")
+        raise UnsupportedKind(f"{name[:100]} is not a kind of photograph: send one of {', '.join(MEDIA_TYPES)}.")
     return kind
 
 

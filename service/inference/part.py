@@ -46,7 +46,7 @@ class Part:
         """Raises ``BadRequest`` where it is empty or leaves a photograph of that size."""
         if not (0 <= self.left < self.right <= width_px and 0 <= self.top < self.bottom <= height_px):
             raise BadRequest.at(
-                f"({self.left}, {self.top}) to ({self.right}, {self.bottom}) is no part of the upright photograph of "
+                f"({self.left}, {self.top}) to ({self.right}, {self.bottom}) is not within the upright photograph of "
                 f"{width_px}x{height_px} pixels.",
                 "roi",
             )
