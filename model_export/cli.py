@@ -44,6 +44,13 @@ Threads = Annotated[
         show_default="those that workers leave",
     ),
 ]
+Data = Annotated[
+    Path,
+    typer.Option(
+        help="folder with rgbd/, tabletop/, d200/, blender/, or any with cameras.json (what is there is used)",
+        exists=True,
+    ),
+]
 Layout = Literal["defocusnet", "ddff12", "nyu"]
 Checkpoint = Annotated[Path, typer.Option(help="checkpoint file of a run, or a model folder", exists=True)]
 
@@ -248,13 +255,7 @@ def _differences(differences: "list[Difference]") -> Table:
 
 @commands.command()
 def evaluate(
-    data: Annotated[
-        Path,
-        typer.Option(
-            help="folder with rgbd/, tabletop/, d200/, blender/, or any with cameras.json (what is there is used)",
-            exists=True,
-        ),
-    ],
+    data: Data,
     model: Model = DEFAULT_MODEL,
     beside: Annotated[
         Path | None, typer.Option(help="another model folder, to be compared on the same pictures", file_okay=False)
