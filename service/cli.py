@@ -65,8 +65,8 @@ def serve(
 ) -> None:
     """Answer requests until stopped. Everything else is set by CAMIND_* variables.
 
-    Exit codes: 0 after SIGTERM or SIGINT, once what was asked is answered; 143 or 130 where a second one did not wait
-    for that; 1 where it cannot start (the address, the model, the database); 2 for a wrong setting.
+    Exit codes: 0 after SIGTERM, SIGINT or SIGHUP, once what was asked is answered; 143 or 130 where a second one did
+    not wait for that; 1 where it cannot start (the address, the model, the database); 2 for a wrong setting.
     """
     settings = _settings(host=host, port=port, model_dir=model)
     with lasting():
@@ -303,13 +303,16 @@ def _seed(engine: Engine, owner: str) -> list[str]:
 
 @cameras_app.command(name="add")
 def add_camera(
-    file: Annotated[typer.FileBinaryRead, typer.Argument(help="JSON as POST /cameras takes it; - for standard input")],
+    file: Annotated[
+        typer.FileBinaryRead,
+        typer.Argument(help="JSON as POST /cameras takes it, or as the page exports cameras; - for standard input"),
+    ],
     replace: Annotated[
         bool, typer.Option("--replace", help="A new revision, where a camera of that name is there and not the same")
     ] = False,
     owner: Owner = LOCAL,
 ) -> None:
-    """Store a camera, known by its k_cam and gamma or by its lens specs."""
+    """Store a camera, known by its k_cam and gamma or by its lens specs, or several."""
     import json
 
     from pydantic import ValidationError
@@ -320,23 +323,25 @@ def add_camera(
 
     with _plain_failures():
         try:
-            body = CameraCreate.model_validate(json.load(file))
+            told = json.load(file)
+            bodies = told["cameras"] if isinstance(told, dict) and isinstance(told.get("cameras"), list) else [told]
+            drafts = [body.to_draft(body.name) for body in map(CameraCreate.model_validate, bodies)]
         except ValidationError as exc:
             raise _failure(str(invalid_model(exc, "body")), WRONG_USE) from exc
         except ValueError as exc:
             raise _failure(f"This is not valid JSON: {exc}", WRONG_USE) from exc
-        draft = body.to_draft(body.name)
         with _ready_engine() as engine:
-            cameras = Cameras(engine, owner)
-            try:
-                record = cameras.add(draft)
-            except Conflict as exc:
-                if not replace:
-                    raise _failure(
-                        f"A camera '{body.name}' exists already: --replace gives it a new revision."
-                    ) from exc
-                record = _replaced(cameras, draft)
-    typer.echo(_line_of(record))
+            for draft in drafts:
+                typer.echo(_line_of(_stored(Cameras(engine, owner), draft, replace=replace)))
+
+
+def _stored(cameras: "Cameras", draft: "CameraDraft", *, replace: bool) -> "CameraRecord":
+    try:
+        return cameras.add(draft)
+    except Conflict as exc:
+        if not replace:
+            raise _failure(f"A camera '{draft.name}' exists already: --replace gives it a new revision.") from exc
+        return _replaced(cameras, draft)
 
 
 def _replaced(cameras: "Cameras", draft: "CameraDraft") -> "CameraRecord":

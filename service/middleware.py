@@ -20,12 +20,13 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from service.api.handlers import log_fault
 from service.api.metrics import Metrics
 from service.api.problems import PROBLEM_KEY, problem_response
-from service.errors import CamindError, ReceiveTimeout, TooLarge
+from service.errors import CamindError, ReceiveTimeout, TooLarge, UnsupportedKind
 from service.tracing import STAGES_KEY, Trace, Tracing
 
 REQUEST_ID = "X-Request-Id"
 SANE_REQUEST_ID = re.compile(r"[A-Za-z0-9._:-]{1,128}")
 CLIENT_GONE = 499
+WITH_BODY = ("POST", "PUT")
 
 log = structlog.stdlib.get_logger("camind.request")
 
@@ -147,9 +148,10 @@ class BodyLimits:
 
 
 class LimitRequests:
-    """Refuses bodies that are too large, by their stated length or by what comes, or that come too slowly.
+    """Refuses bodies that are too large, by their stated length or by what comes, that come too slowly, or compressed.
 
-    ``limits_by_path`` overrides ``limits`` for single paths. Raises ``TooLarge``, ``ReceiveTimeout``.
+    ``limits_by_path`` overrides ``limits`` for single paths. Raises ``TooLarge``, ``ReceiveTimeout``,
+    ``UnsupportedKind``.
     """
 
     def __init__(self, app: ASGIApp, limits: BodyLimits, limits_by_path: Mapping[str, BodyLimits]) -> None:
@@ -162,7 +164,10 @@ class LimitRequests:
             await self._app(scope, receive, send)
             return
         limits = self._limits_by_path.get(scope["path"], self._limits)
-        stated = Headers(scope=scope).get("content-length", "")
+        headers = Headers(scope=scope)
+        coding, stated = headers.get("content-encoding", "identity"), headers.get("content-length", "")
+        if scope["method"] in WITH_BODY and coding != "identity":
+            raise UnsupportedKind(f"Send the body as it is, without Content-Encoding: {coding[:40]}.")
         if stated.isdecimal() and int(stated[:20]) > limits.max_bytes:
             raise _too_large(limits.max_bytes)
         await self._app(scope, _LimitedBody(receive, limits), send)

@@ -185,7 +185,9 @@ class StoppingServer(uvicorn.Server):
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
         """Take the signals to stop; the base class would raise them again at the end, and so not end with 0."""
-        before = {number: signal.signal(number, self.handle_exit) for number in STOP_SIGNALS}
+        is_nohup = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+        numbers = STOP_SIGNALS if is_nohup else (*STOP_SIGNALS, signal.SIGHUP)
+        before = {number: signal.signal(number, self.handle_exit) for number in numbers}
         try:
             yield
         finally:

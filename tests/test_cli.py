@@ -243,6 +243,17 @@ def test_what_is_no_new_camera_is_said(specs: str, code: int, said: str) -> None
     assert at_once("cameras", "list").stdout.count("\n") == 1
 
 
+@pytest.mark.usefixtures("bench")
+def test_cameras_that_the_page_exports_are_stored() -> None:
+    exported = {"cameras": [BENCH, {**BENCH, "name": "other"}]}
+    assert "exists already" in at_once("cameras", "add", "-", said=json.dumps(exported)).stderr
+    stored = at_once("cameras", "add", "--replace", "-", said=json.dumps(exported))
+    assert [line.split("\t")[:2] for line in stored.stdout.splitlines()] == [["bench", "r1"], ["other", "r1"]]
+    half = {"cameras": [{**BENCH, "name": "third"}, {"name": "half"}]}
+    assert at_once("cameras", "add", "-", said=json.dumps(half)).exit_code == 2
+    assert "third" not in at_once("cameras", "list").stdout
+
+
 @pytest.mark.parametrize("known_by", [{}, {"k_cam_px": None, "lens": LENS_EXAMPLE["lens"]}], ids=["k_cam", "lens"])
 @pytest.mark.usefixtures("bench")
 def test_a_camera_is_shown_as_what_stores_it_and_replaced_and_deleted(known_by: dict[str, object]) -> None:

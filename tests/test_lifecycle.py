@@ -53,7 +53,7 @@ def test_it_says_that_it_stops_while_it_still_answers(tmp_path: Path, tiny_model
         assert time.monotonic() - started_s >= DRAIN_S
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_request_in_flight_is_answered_before_the_end(server: Server, number: signal.Signals) -> None:
     body = json.dumps(CAMERA).encode()
     head = f"POST /cameras HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"

@@ -115,13 +115,14 @@ def estimator() -> Estimator:
     return Estimator.from_folder(load_model_folder(SHIPPED_MODEL), intra_op_threads=1)
 
 
-@pytest.mark.parametrize("folder", [SHIPPED_MODEL, SHIPPED_MODEL / INT8], ids=["float32", "int8"])
-def test_it_scores_what_its_card_says(folder: Path) -> None:
-    examiner = Examiner(folder)
-    found = summarise(FIXED, "gt", [examiner.answer(case)[0] for case in fixed_cases()])
-    recorded = load_model_folder(folder).manifest.scores
-    assert found.mean.abs_rel == pytest.approx(recorded["fixed.abs_rel"], rel=0.02)
-    assert found.pooled.rmse == pytest.approx(recorded["fixed.rmse_m"], rel=0.02)
+def test_either_precision_scores_what_its_card_says() -> None:
+    cases = tuple(fixed_cases())
+    for folder in (SHIPPED_MODEL, SHIPPED_MODEL / INT8):
+        examiner = Examiner(folder)
+        found = summarise(FIXED, "gt", [examiner.answer(case)[0] for case in cases])
+        recorded = load_model_folder(folder).manifest.scores
+        assert found.mean.abs_rel == pytest.approx(recorded["fixed.abs_rel"], rel=0.02)
+        assert found.pooled.rmse == pytest.approx(recorded["fixed.rmse_m"], rel=0.02)
 
 
 def test_int8_is_served_when_set_and_answers_nearly_the_same(server: Server, tmp_path: Path) -> None:

@@ -15,7 +15,6 @@ WIDTH, HEIGHT, PLANE_RESOLUTION, PLANE_UNIT = 0xA002, 0xA003, 0xA20E, 0xA210
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 MOST_TEXT = 64
 FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)  # of what a 35-mm equivalent is seen on
-INFINITY = 2**32 - 1  # all ones, in a distance
 # what phones write beyond the standard's 0 and 1
 RENDERINGS = {6: "a panorama", 7: "a portrait mode", 8: "a portrait mode"}
 
@@ -57,32 +56,27 @@ def read_exif(exif: bytes) -> Exif:
 
 
 def _with_shot(body: Exif, shot: TiffDirectory) -> Exif:
-    width, height = _number(shot, WIDTH), _number(shot, HEIGHT)
+    width, height = shot.number(WIDTH), shot.number(HEIGHT)
     return replace(
         body,
         lens=_text(shot, LENS_MODEL),
-        focal_length_mm=_number(shot, FOCAL_LENGTH),
-        focal_length_35mm=_number(shot, FOCAL_LENGTH_35MM),
-        f_number=_number(shot, F_NUMBER),
-        subject_distance_m=_number(shot, SUBJECT_DISTANCE),
-        digital_zoom=_number(shot, DIGITAL_ZOOM),
+        focal_length_mm=shot.number(FOCAL_LENGTH),
+        focal_length_35mm=shot.number(FOCAL_LENGTH_35MM),
+        f_number=shot.number(F_NUMBER),
+        subject_distance_m=shot.number(SUBJECT_DISTANCE),
+        digital_zoom=shot.number(DIGITAL_ZOOM),
         width_px=int(width) if width else None,
         height_px=int(height) if height else None,
         focal_plane_pitch_um=_pitch_um(shot),
-        rendering=RENDERINGS.get(int(_number(shot, RENDERED) or 0)),
+        rendering=RENDERINGS.get(int(shot.number(RENDERED) or 0)),
     )
 
 
 def _pitch_um(shot: TiffDirectory) -> float | None:
-    pixels_per_unit, unit = _number(shot, PLANE_RESOLUTION), _number(shot, PLANE_UNIT) or 2
+    pixels_per_unit, unit = shot.number(PLANE_RESOLUTION), shot.number(PLANE_UNIT) or 2
     if pixels_per_unit is None or unit not in MM_PER_UNIT:
         return None
     return 1e3 * MM_PER_UNIT[int(unit)] / pixels_per_unit
-
-
-def _number(directory: TiffDirectory, tag: int) -> float | None:
-    number = directory.number(tag)
-    return number if number is not None and number < INFINITY else None
 
 
 def _text(directory: TiffDirectory, tag: int) -> str | None:

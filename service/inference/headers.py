@@ -40,6 +40,7 @@ MOST_DIRECTORIES = 16
 TIFF_TYPES = {1: "B", 3: "H", 4: "I", 13: "I"}
 # with those that are no whole numbers: a rational is two
 TIFF_NUMBERS = {**TIFF_TYPES, 5: "II", 11: "f", 12: "d"}
+INFINITY = 2**32 - 1  # above a fraction
 TIFF_TEXT, TIFF_MOST_TEXT = 2, 256
 EXIF_DIRECTORY, TIFF_PROFILE = 34665, 34675
 TIFF_MAX_VALUES = 100_000
@@ -381,7 +382,7 @@ class TiffDirectory:
         return b"" if at is None else self._data[at : at + self._unpack("I", self._entries[tag] + 4)[0]]
 
     def number(self, tag: int) -> float | None:
-        """A tag's first number, of any type; None without one that is positive and finite."""
+        """A tag's first number, of any type; None without one that is positive and finite (all ones are infinity)."""
         at = self.offset_of(tag)
         if at is None:
             return None
@@ -389,6 +390,8 @@ class TiffDirectory:
         if kind not in TIFF_NUMBERS:
             return None
         over, *under = self._unpack(TIFF_NUMBERS[kind], at)
+        if over == INFINITY:
+            return None
         value = over / (under[0] or math.nan) if under else over
         return value if 0 < value < math.inf else None
 

@@ -1,5 +1,6 @@
 """What may arrive all at once, request ids, and the one log event of a request."""
 
+import gzip
 from typing import Any
 
 import pytest
@@ -40,6 +41,15 @@ def test_too_much_at_once_is_busy_and_is_forgotten(app: FastAPI, client: TestCli
     app.state.arrivals = Arrivals(2 * len(body) + 1000)
     for _ in range(3):
         assert client.post("/photographs/preview", **sent).status_code == 200
+
+
+def test_a_compressed_body_is_refused_by_that_name(client: TestClient) -> None:
+    for path, body in (("/cameras", b"{}"), ("/photographs/preview", png(corners()))):
+        refused = client.post(path, content=gzip.compress(body), headers={"Content-Encoding": "gzip"})
+        assert (refused.status_code, refused.json()["type"]) == (415, "urn:camind:problem:unsupported-kind")
+        assert "Content-Encoding: gzip" in refused.json()["detail"]
+    plain = client.post("/photographs/preview", content=png(corners()), headers={"Content-Encoding": "identity"})
+    assert plain.status_code == 200
 
 
 @pytest.mark.parametrize("given", ["abc", "0f8b-4.2_1:x", "a" * 128])

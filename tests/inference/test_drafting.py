@@ -78,7 +78,7 @@ def test_without_exif_there_are_no_tags(data: bytes) -> None:
     assert (found.make, found.focal_length_mm, found.f_number, found.focal_plane_pitch_um) == (None,) * 4
 
 
-@pytest.mark.parametrize("value", [(0, 1), (0, 0), (5, 0), (2**32 - 1, 1)])
+@pytest.mark.parametrize("value", [(0, 1), (0, 0), (5, 0), (2**32 - 1, 1), (2**32 - 1, 1000)])
 def test_a_number_that_means_unknown_is_none(value: tuple[int, int]) -> None:
     shot = {F_NUMBER: value, SUBJECT: value, FOCAL: value, PLANE_RESOLUTION: value}
     found = read_exif(exif_of({}, shot))
