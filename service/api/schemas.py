@@ -47,7 +47,10 @@ class LensSpecs(Given):
     ]
     sensor_width_px: Annotated[
         Pixels,
-        Field(description="The whole sensor along the images' width, in its own pixels: of tall images its short side"),
+        Field(
+            description="What the images show of the sensor, along their width, in its own pixels: all of it but in a crop "
+            "mode; of tall images its short side"
+        ),
     ]
     k_r: Annotated[
         float,
