@@ -48,8 +48,8 @@ class LensSpecs(Given):
     sensor_width_px: Annotated[
         Pixels,
         Field(
-            description="What the images show of the sensor, along their width, in its own pixels: all of it but in a crop "
-            "mode; of tall images its short side"
+            description="What the images show of the sensor, along their width, in its own pixels: all of it but in a "
+            "crop mode; of tall images its short side"
         ),
     ]
     k_r: Annotated[

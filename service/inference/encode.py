@@ -10,6 +10,7 @@ import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
+from zipfile import ZipFile
 
 import numpy as np
 import tifffile
@@ -135,7 +136,7 @@ def encode_npy(answer: DepthMap, _: Beside) -> Encoded:
 def encode_npz(answer: DepthMap, beside: Beside) -> Encoded:
     """Maps by their names, ``K`` float64 [3, 3], NaN and a warning if unknown, ``distortion`` if there is any.
 
-    ``origin`` is JSON, as bytes: many programs read no other arrays than of numbers.
+    The zip's comment is the origin, JSON: it is in nobody's way who reads arrays.
     """
     distortion = _distortion(answer)
     matrix = camera_matrix(answer)
@@ -143,9 +144,10 @@ def encode_npz(answer: DepthMap, beside: Beside) -> Encoded:
     arrays: dict[str, Any] = {name: getattr(answer, name) for name in beside.maps} | {"K": matrix}
     if distortion.any():
         arrays["distortion"] = distortion
-    arrays["origin"] = np.frombuffer(json.dumps(beside.told()).encode(), np.uint8)
     stream = io.BytesIO()
     np.savez(stream, **arrays)
+    with ZipFile(stream, "a") as archive:
+        archive.comment = json.dumps(beside.told()).encode()
     return Encoded(stream.getvalue(), MEDIA_TYPES["npz"], warnings=unknown)
 
 

@@ -4,6 +4,7 @@
 
 const END_OF_DIRECTORY = 0x06054b50;
 const END_BYTES = 22;
+const MOST_COMMENT_BYTES = 65535;
 const DIRECTORY_ENTRY_BYTES = 46;
 const LOCAL_HEADER_BYTES = 30;
 const MAGIC_BYTES = 8;
@@ -17,9 +18,12 @@ const KINDS = { "<f4": Float32Array, "<f8": Float64Array, "|b1": Uint8Array, "|u
  * @returns {Promise<Map<string, NumpyArray>>} arrays by their names
  */
 export async function readNpz(file) {
-	const end = new DataView(await file.slice(-END_BYTES).arrayBuffer());
-	if (end.byteLength < END_BYTES || end.getUint32(0, true) !== END_OF_DIRECTORY) throw new Error("This is no whole npz.");
-	const [count, directoryBytes, start] = [end.getUint16(10, true), end.getUint32(12, true), end.getUint32(16, true)];
+	const last = new DataView(await file.slice(-END_BYTES - MOST_COMMENT_BYTES).arrayBuffer());
+	let end = last.byteLength - END_BYTES;
+	while (end >= 0 && last.getUint32(end, true) !== END_OF_DIRECTORY) end--;
+	if (end < 0) throw new Error("This is no whole npz.");
+	const count = last.getUint16(end + 10, true);
+	const [directoryBytes, start] = [12, 16].map((place) => last.getUint32(end + place, true));
 	const directory = new DataView(await file.slice(start, start + directoryBytes).arrayBuffer());
 	const arrays = new Map();
 	for (let entry = 0, at = 0; entry < count; entry++) {
