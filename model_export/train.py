@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 from rich.console import Console
+from rich.progress import Progress
 from torch import Tensor, nn
 from torch.nn.utils import convert_conv2d_weight_memory_format
 from torch.utils.data import DataLoader, Dataset
@@ -593,6 +594,9 @@ def train(
     path = run / CHECKPOINT
     trainer, start = _opened(config, path, weights, teachers, device, console, fresh_decoders=fresh_decoders)
     config = trainer.config
+    if trainer.step == config.steps:
+        console.print(f"{run} is at its end: go on with more --steps, or begin a new --run with --weights {path}")
+        return path
     pools = Pools(config, material, trainer.step, workers, device)
     test = held_out(config.scenes, material, min(2 * config.batch, MOST_HELD_OUT)).changed(trainer.moved)
     # by itself not on a core with a worker: two busy processes there cost each far more than half its speed
@@ -603,15 +607,19 @@ def train(
             if weights.is_dir():
                 _spread(start, trainer, pools)
             trainer.begin_with(with_fresh_decoders(start) if fresh_decoders else start)
-        task = progress.add_task("training", total=config.steps, completed=trainer.step)
-        with _interruptible() as asked:
-            for said in _steps(trainer, pools, test, path):
-                progress.update(task, completed=trainer.step)
-                if said is not None:
-                    console.print(said)
-                if asked.is_set() and trainer.step < config.steps:
-                    raise _stopped(trainer, path, console)
+        _step_to_end(trainer, pools, test, path, progress)
     return path
+
+
+def _step_to_end(trainer: Trainer, pools: Pools, test: Batch, path: Path, progress: Progress) -> None:
+    task = progress.add_task("training", total=trainer.config.steps, completed=trainer.step)
+    with _interruptible() as asked:
+        for said in _steps(trainer, pools, test, path):
+            progress.update(task, completed=trainer.step)
+            if said is not None:
+                progress.console.print(said)
+            if asked.is_set() and trainer.step < trainer.config.steps:
+                raise _stopped(trainer, path, progress.console)
 
 
 def _stopped(trainer: Trainer, path: Path, console: Console) -> KeyboardInterrupt:
@@ -677,7 +685,8 @@ def _opened(
         _require_onward(config, resume, path.parent)
         config = replace(config, settled_share=resume.config.settled_share)
         changed = config.unlike(resume.config)
-        console.print(f"going on from step {resume.step}" + (f", with {', '.join(changed)}" if changed else ""))
+        if resume.step < config.steps:
+            console.print(f"going on from step {resume.step}" + (f", with {', '.join(changed)}" if changed else ""))
     start = starting_pair(weights, config.kind) if weights is not None and resume is None else None
     if resume is not None:
         trainer = Trainer(config, device, resume)

@@ -123,6 +123,16 @@ def test_a_run_that_is_gone_on_with_keeps_its_settings_and_says_what_is_new(text
         train(again, textures, folder, workers=0, device="cude")
 
 
+def test_a_run_at_its_end_says_so_and_draws_nothing(
+    textures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(CONFIG, textures, tmp_path / "run")
+    monkeypatch.delattr("model_export.train.draw_sample")
+    checkpoint, said = run(CONFIG, textures, tmp_path / "run")
+    assert checkpoint.step == 6
+    assert said.replace("\n", "").startswith(f"{tmp_path / 'run'} is at its end: go on with more --steps, or begin")
+
+
 def test_an_interrupted_run_saves_what_it_did(textures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     advance = Trainer.advance
 
