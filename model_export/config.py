@@ -11,6 +11,13 @@ LARGER = 2  # times as wide and as high
 LARGE_SEED = 2**16  # larger pictures' seed is so much above
 MOST_SEED = 255  # the scenes that models are scored on have those above
 
+Share = Annotated[float, Field(ge=0, le=1)]
+Weight = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Span = tuple[Positive, Positive]
+Quality = Annotated[int, Field(ge=1, le=100)]
+Count = Annotated[int, Field(ge=1)]
+
 Kind = Literal["compact", "paper"]
 Learning = Literal["all", "depth", "layout"]
 Part = Literal["blur", "depth", "depth.layout"]
@@ -27,23 +34,23 @@ class SceneConfig:
     that show no mosaic, and ``clean_share`` have none.
     """
 
-    size_px: int = 192
-    margin_px: int = 32
-    k_cam_px: tuple[float, float] = (0.5, 30.0)
-    gamma_px: tuple[float, float] = (0.3, 1.6)
-    focus_distance_m: tuple[float, float] = (0.2, 5.0)
-    focal_length_px: tuple[float, float] = (150.0, 2500.0)
-    defocus_px: tuple[float, float] = (0.4, 20.0)
-    depth_ratio: tuple[float, float] = (0.15, 8.0)
-    jpeg_quality: tuple[int, int] = (60, 98)
-    frame_share: float = 0.5
-    wall_share: float = 0.2
-    room_share: float = 0.5
-    layered_share: float = 0.7
-    max_layers: int = 6
-    close_share: float = 0.5
-    grey_share: float = 0.0
-    clean_share: float = 0.0
+    size_px: Annotated[int, Field(ge=16, multiple_of=16)] = 192
+    margin_px: Annotated[int, Field(ge=0)] = 32
+    k_cam_px: Span = (0.5, 30.0)
+    gamma_px: Span = (0.3, 1.6)
+    focus_distance_m: Span = (0.2, 5.0)
+    focal_length_px: Span = (150.0, 2500.0)
+    defocus_px: Span = (0.4, 20.0)
+    depth_ratio: Span = (0.15, 8.0)
+    jpeg_quality: tuple[Quality, Quality] = (60, 98)
+    frame_share: Share = 0.5
+    wall_share: Share = 0.2
+    room_share: Share = 0.5
+    layered_share: Share = 0.7
+    max_layers: Count = 6
+    close_share: Share = 0.5
+    grey_share: Share = 0.0
+    clean_share: Share = 0.0
 
 
 # depth differs more within a picture than in those that are scored: of such a mixture networks learn outlines
@@ -75,31 +82,31 @@ class TrainConfig:
 
     kind: Kind = "compact"
     seed: Annotated[int, Field(ge=0, le=MOST_SEED)] = 1
-    steps: Annotated[int, Field(ge=1)] = 12_000
-    batch: Annotated[int, Field(ge=1)] = 8
-    learning_rate: float = 1e-3
-    weight_decay: float = 1e-4
-    warmup_steps: int = 200
-    decay_share: float = 0.5
-    clip_norm: float = 1.0
-    b_weight: float = 1.0
-    side_weight: float = 0.3
+    steps: Count = 12_000
+    batch: Count = 8
+    learning_rate: Positive = 1e-3
+    weight_decay: Weight = 1e-4
+    warmup_steps: Count = 200
+    decay_share: Share = 0.5
+    clip_norm: Positive = 1.0
+    b_weight: Weight = 1.0
+    side_weight: Weight = 0.3
     taught: bool = False
     all_mirrors: bool = False
-    teacher_shares: tuple[tuple[float, float], ...] = ()
+    teacher_shares: tuple[tuple[Weight, Weight], ...] = ()
     learning: Learning = "all"
-    likeness_weight: float = 10.0
-    pool: Annotated[int, Field(ge=1)] = 600
-    fresh_per_step: float = 1.0
+    likeness_weight: Weight = 10.0
+    pool: Count = 600
+    fresh_per_step: Weight = 1.0
     retaken: bool = False
-    turned_share: float = 0.3
-    hint_share: float = 0.5
-    large_share: float = 0.0
-    faded_share: float = 0.0
-    dimmed_share: float = 0.0
-    checkpoint_every: Annotated[int, Field(ge=1)] = 250
-    settled_share: float = 0.35
-    settle_batches: int = 60
+    turned_share: Share = 0.3
+    hint_share: Share = 0.5
+    large_share: Share = 0.0
+    faded_share: Share = 0.0
+    dimmed_share: Share = 0.0
+    checkpoint_every: Count = 250
+    settled_share: Share = 0.35
+    settle_batches: Count = 60
     scenes: SceneConfig = MIXTURE
 
     def enlarged(self) -> "TrainConfig":

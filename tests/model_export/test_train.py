@@ -68,6 +68,12 @@ def test_no_seed_that_is_allowed_draws_scenes_that_are_scored() -> None:
         ("scenes.k_cam_px=[20,1]", "lower"),
         ("batch=0", "batch: "),
         ("seed=256", "seed: "),
+        ("decay_share=-3", "decay_share: .*greater"),
+        ("scenes.frame_share=2", "scenes.frame_share: .*less"),
+        ("learning_rate=NaN", "learning_rate: .*finite"),
+        ("warmup_steps=0", "warmup_steps: "),
+        ("scenes.k_cam_px=[0,20]", "scenes.k_cam_px.0: "),
+        ("scenes.size_px=50", "scenes.size_px: .*multiple of 16"),
     ],
 )
 def test_what_is_no_setting_is_refused_by_name(setting: str, said: str) -> None:
