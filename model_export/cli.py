@@ -75,9 +75,10 @@ def _print(tables: Iterable[Table]) -> None:
 
 @contextmanager
 def _training_parts() -> Iterator[None]:
-    """Around the imports that need torch: what is missing is said with its remedy."""
+    """Around the imports that need torch, which take seconds: what is missing is said with its remedy."""
     try:
-        yield
+        with Console(stderr=True).status("loading"):
+            yield
     except ModuleNotFoundError as exc:
         raise _fail(f"{exc.name} is not installed: pip install 'camind[train]' brings it") from exc
 

@@ -179,8 +179,9 @@ def narrow(
         batches = list(pool.settling())
         spread_norms(wide, (partial(run_pair, wide, batch) for batch in batches))
         pair = narrowed(wide, widths, progress.track(batches, description="channels"))
-    Checkpoint(config, 0, pair.modules().state_dict(), []).save(out)
-    test = held_out(config.scenes, material, 2 * config.batch)
+        Checkpoint(config, 0, pair.modules().state_dict(), []).save(out)
+        numbers = progress.track(range(2 * config.batch), description="held-out scenes")
+        test = held_out(config.scenes, material, numbers)
     with torch.inference_mode():
         (blur, depth), (narrow_blur, narrow_depth) = (run_pair(either, test) for either in (wide, pair))
     changed_blur = (torch.log(narrow_blur.blur_px) - torch.log(blur.blur_px)).abs().mean()

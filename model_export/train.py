@@ -248,9 +248,9 @@ def _batch(
     return Batch(image.contiguous(memory_format=torch.channels_last), excess, *columns, place=place, mirrors=mirrors)
 
 
-def held_out(scenes: SceneConfig, material: Material, count: int) -> Batch:
+def held_out(scenes: SceneConfig, material: Material, numbers: Iterable[int]) -> Batch:
     """Scenes of seeds no training draws, as one batch."""
-    samples = [draw_sample(HELD_OUT_SEED + i, scenes, material) for i in range(count)]
+    samples = [draw_sample(HELD_OUT_SEED + i, scenes, material) for i in numbers]
     return collate(samples, np.random.default_rng(HELD_OUT_SEED))
 
 
@@ -589,18 +589,20 @@ def train(
     """
     console = console or Console(stderr=True)
     _require_device(device)
-    material = Material(load_photographs(textures), [] if frames is None else load_frames(frames))
-    run.mkdir(parents=True, exist_ok=True)
     path = run / CHECKPOINT
-    trainer, start = _opened(config, path, weights, teachers, device, console, fresh_decoders=fresh_decoders)
+    with console.status("reading pictures and weights"):
+        material = Material(load_photographs(textures), [] if frames is None else load_frames(frames))
+        run.mkdir(parents=True, exist_ok=True)
+        trainer, start = _opened(config, path, weights, teachers, device, console, fresh_decoders=fresh_decoders)
     config = trainer.config
     if trainer.step == config.steps:
         console.print(f"{run} is at its end: go on with more --steps, or begin a new --run with --weights {path}")
         return path
     pools = Pools(config, material, trainer.step, workers, device)
-    test = held_out(config.scenes, material, min(2 * config.batch, MOST_HELD_OUT)).changed(trainer.moved)
     # by itself not on a core with a worker: two busy processes there cost each far more than half its speed
     with torch_threads(threads or max(1, available_cores() - workers)), progress_bar(console) as progress:
+        numbers = progress.track(range(min(2 * config.batch, MOST_HELD_OUT)), description="held-out scenes")
+        test = held_out(config.scenes, material, numbers).changed(trainer.moved)
         for _ in progress.track(pools.fill(), total=pools.size, description="scenes"):
             pass
         if start is not None and weights is not None:

@@ -23,7 +23,7 @@ NARROW = Widths((16, 16, 16, 32), (16, 16, 16, 32))
 
 @pytest.fixture(scope="module")
 def batch() -> Batch:
-    return held_out(SceneConfig(size_px=64, margin_px=16), Material(), 4)
+    return held_out(SceneConfig(size_px=64, margin_px=16), Material(), range(4))
 
 
 def blur_and_depth(pair: Pair, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:

@@ -34,7 +34,7 @@ def shipped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def batch() -> Batch:
-    return held_out(SceneConfig(size_px=64, margin_px=16), Material(), 4)
+    return held_out(SceneConfig(size_px=64, margin_px=16), Material(), range(4))
 
 
 def differences(pair: Pair, batch: Batch) -> list[float]:

@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import re
 import signal
 from collections.abc import Iterator
 from dataclasses import replace
@@ -109,6 +110,7 @@ def test_a_run_reports_and_ends_in_a_checkpoint(textures: Path, tmp_path: Path) 
     assert checkpoint.step == 6
     assert checkpoint.config == CONFIG
     assert "step 3: loss" in said
+    assert re.search("held-out scenes .* 4/4", said)
     assert "held out" in said
     assert "scenes/s, waited" in said
 
