@@ -208,7 +208,7 @@ def export(
     if out.resolve() == checkpoint.resolve():
         raise _fail(f"{out} would be written over while it is read")
     with _training_parts():
-        from model_export.corrections import calibrate, unseen_cases
+        from model_export.corrections import ALL_SCENES, calibrate, unseen_cases
         from model_export.export import export_checkpoint
         from model_export.quantized import quantised_graphs
 
@@ -216,14 +216,13 @@ def export(
     # what breaks off leaves no folder that serves, without its corrections
     with TemporaryDirectory() as scratch, progress_bar(Console(stderr=True)) as progress, _plain_failures():
         built = Path(scratch)
-        task = progress.add_task("float32", total=5)
+        task = progress.add_task("float32", total=4)
         manifest = export_checkpoint(checkpoint, pictures, built, name)
         progress.update(task, advance=1, description=INT8)
         in_int8 = partial(quantised_graphs, floating=built)
         export_checkpoint(checkpoint, pictures, built / INT8, f"{manifest.name}-{INT8}", in_int8)
-        progress.update(task, advance=1, description="held-out scenes")
-        cases = unseen_cases()
-        progress.advance(task)
+        progress.update(task, advance=1, description="corrections")
+        cases = list(progress.track(unseen_cases(), ALL_SCENES, description="held-out scenes"))
         found = {}
         for folder in (Path(), Path(INT8)):
             found[out / folder] = calibrate(built / folder, cases)

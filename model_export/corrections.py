@@ -1,7 +1,7 @@
 """Two numbers for the manifest, found on scenes that were not trained on: blur right on the whole, errors honest."""
 
-import itertools
 import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +11,11 @@ from model_export.evaluate import Examiner, Pixels
 from service.inference.artifact import Manifest, load_model_folder, write_manifest
 
 SCENES = 200  # of each side: the temperature's standard error is 0.04
+ALL_SCENES = SCENES * len(PROCEDURAL_SIDES)
 FIRST = 2**20  # far from the scenes that evaluation draws
 WELL_READ_PX = (1.0, 8.0)
 HELD = ((1, 0.68), (2, 0.95))  # what intervals of so many deviations should hold
 DECIMALS = 3
-
-Cases = dict[int, list[Case]]
 
 
 def blur_gain(pixels: Pixels) -> float:
@@ -32,12 +31,13 @@ def temperature(pixels: Pixels) -> float:
     return float(math.prod(needed) ** (1 / len(needed)))
 
 
-def unseen_cases() -> Cases:
-    """Scenes by the side of focus that they are on, drawn once for every model folder."""
-    return {side: list(procedural_cases(SCENES, side, FIRST)) for side in PROCEDURAL_SIDES.values()}
+def unseen_cases() -> Iterator[Case]:
+    """Scenes on either side of focus and on both, to be drawn once for every model folder."""
+    for side in PROCEDURAL_SIDES.values():
+        yield from procedural_cases(SCENES, side, FIRST)
 
 
-def calibrate(model: Path, cases: Cases) -> tuple[float, float]:
+def calibrate(model: Path, cases: Sequence[Case]) -> tuple[float, float]:
     """Find both for a model folder and write them into its manifest: ``blur_gain`` and ``temperature``.
 
     Blur is that of scenes on either side of focus and on both. Errors are those where the side is told: being on the
@@ -45,10 +45,10 @@ def calibrate(model: Path, cases: Cases) -> tuple[float, float]:
     temperature in bounds makes right.
     """
     examiner = Examiner(model)
-    seen = [examiner.answer(case)[0].blur for case in itertools.chain(*cases.values())]
+    seen = [examiner.answer(case)[0].blur for case in cases]
     gain = _told(model, "blur_gain", blur_gain(Pixels.joined([blur for blur in seen if blur is not None])))
     examiner = Examiner(model)
-    told = [examiner.told(case, case.camera)[0].depth for side in (-1, 1) for case in cases[side]]
+    told = [examiner.told(case, case.camera)[0].depth for case in cases if case.side != "auto"]
     found = temperature(Pixels.joined(told))
     return gain, _told(model, "temperature", found)
 

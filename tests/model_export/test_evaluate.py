@@ -281,7 +281,7 @@ def test_what_is_found_is_written_down(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr("model_export.corrections.SCENES", 1)
     monkeypatch.setattr("model_export.corrections.blur_gain", partial(_told, 0.9))
     monkeypatch.setattr("model_export.corrections.temperature", partial(_told, found))
-    assert calibrate(folder, unseen_cases()) == (0.9, found)
+    assert calibrate(folder, list(unseen_cases())) == (0.9, found)
     manifest = load_model_folder(folder).manifest
     assert (manifest.blur_gain, manifest.temperature) == (0.9, found)
 
