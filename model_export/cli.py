@@ -247,9 +247,9 @@ def verify(checkpoint: Checkpoint, model: Model = DEFAULT_MODEL) -> None:
 
 
 def _differences(differences: "list[Difference]") -> Table:
-    table = Table("size", "output", "largest relative difference")
+    table = Table("size", "graph", "output", "largest relative difference")
     for d in differences:
-        table.add_row(f"{d.width_px}x{d.height_px}", d.output, f"{d.relative:.1e}")
+        table.add_row(f"{d.width_px}x{d.height_px}", d.graph, d.output, f"{d.relative:.1e}")
     return table
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from model_export.losses import correct
 from model_export.networks import LaidOutEstimate, Pair, Scene
 from model_export.train import Checkpoint
-from service.inference.artifact import LAYOUT_MAP, LAYOUT_ODDS, load_model_folder
+from service.inference.artifact import BLUR_OUTPUTS, LAYOUT_MAP, LAYOUT_ODDS, load_model_folder
 
 SIZES = ((64, 64), (240, 320), (480, 640))
 TOLERANCE = 1e-3
@@ -29,6 +29,7 @@ class Difference:
 
     height_px: int
     width_px: int
+    graph: str
     output: str
     relative: float
 
@@ -47,19 +48,19 @@ def verify_pair(pair: Pair, folder: Path) -> list[Difference]:
         expected, feeds = through_torch(pair, image, CAMERA, loaded.manifest.graphs.feature_names)
         seen = _run(blur, {"image": image})
         told = _run(depth, feeds | seen)
-        differences += _differences(expected, seen | told, height, width)
+        of_blur = {name: expected.pop(name) for name in BLUR_OUTPUTS}
+        differences += _differences(of_blur, seen, loaded.blur_graph, height, width)
+        differences += _differences(expected, told, loaded.depth_graph, height, width)
         if loaded.layout_graph is not None:
             layout = onnxruntime.InferenceSession(loaded.layout_graph, options, providers=providers)
             alone = {LAYOUT_ODDS: expected[LAYOUT_ODDS]}
-            differences += _differences(alone, _run(layout, told), height, width)
+            differences += _differences(alone, _run(layout, told), loaded.layout_graph, height, width)
     return differences
 
 
-def _differences(expected: Arrays, got: Arrays, height: int, width: int) -> list[Difference]:
-    return [
-        Difference(height, width, name, float(np.abs(got[name] - value).max() / max(np.abs(value).max(), LEAST)))
-        for name, value in expected.items()
-    ]
+def _differences(expected: Arrays, got: Arrays, graph: Path, height: int, width: int) -> list[Difference]:
+    largest = ((name, np.abs(got[name] - value).max(), np.abs(value).max()) for name, value in expected.items())
+    return [Difference(height, width, graph.name, name, float(off / max(most, LEAST))) for name, off, most in largest]
 
 
 def _picture(height: int, width: int) -> NDArray[np.float32]:

@@ -72,6 +72,7 @@ def in_int8(compact: tuple[Pair, Path], tmp_path_factory: pytest.TempPathFactory
 def test_onnx_runtime_answers_as_torch_on_three_sizes(exported: tuple[Pair, Path]) -> None:
     differences = verify_pair(*exported)
     assert {(d.height_px, d.width_px) for d in differences} == set(SIZES)
+    assert len({(d.height_px, d.width_px, d.graph, d.output) for d in differences}) == len(differences)
     assert max(d.relative for d in differences) <= TOLERANCE
 
 
