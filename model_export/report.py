@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-import cv2
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,6 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from model_export.cases import UNSEEN_K_CAM_PX, VIEWS
+from model_export.datasets.photos import write_image
 from model_export.evaluate import (
     EQUAL_BLUR_PX,
     EQUAL_DEFOCUS,
@@ -159,7 +159,7 @@ def _write_examples(report: Report, folder: Path) -> dict[str, str]:
         depths = render_preview(np.hstack([example.truth_m, example.depth_m]))
         row = np.hstack([example.image, depths, grey])
         files[name] = f"{name.replace(' ', '_')}.png"
-        cv2.imwrite(str(folder / files[name]), row[:, :, ::-1])
+        write_image(folder / files[name], row)
     return files
 
 
