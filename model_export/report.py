@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from model_export.cases import UNSEEN_K_CAM_PX, VIEWS
+from model_export.cases import FIXED, UNSEEN_K_CAM_PX, VIEWS
 from model_export.datasets.photos import write_image
 from model_export.evaluate import (
     EQUAL_BLUR_PX,
@@ -193,9 +193,12 @@ def _curve(axes: Axes, at: Map, pixels: Pixels, label: str, *, logarithmic: bool
 
 
 def _of_depth(report: Report) -> list[Summary]:
-    """The sets that the plots of depth show: the camera is known, and blur belongs to the picture."""
-    shown = ("procedural", "blender", "indoor", "d200")
-    return [s for s in report.sets if s.mode == "gt" and s.name.startswith(shown)]
+    """The sets that the plots of depth show, users' own among them: the camera is known, blur belongs to the picture.
+
+    Frames and table tops are shown together, as indoor ones.
+    """
+    left_out = ("plane", FIXED, "rgbd", "tabletop")
+    return [s for s in report.sets if s.mode == "gt" and s.name.split()[0] not in left_out]
 
 
 def _against_distance(axes: Axes, report: Report) -> None:

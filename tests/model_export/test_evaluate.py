@@ -35,12 +35,13 @@ from model_export.evaluate import (
     Examiner,
     Pixels,
     Relief,
+    Report,
     Sides,
     blur_ranges,
     evaluate,
     summarise,
 )
-from model_export.report import beside
+from model_export.report import beside, write
 from service.inference.artifact import Interval, load_model_folder, write_manifest
 from service.optics import thin_lens
 from service.optics.camera import Camera
@@ -179,6 +180,15 @@ def test_two_models_are_compared_on_the_same_pictures(tiny_model_dir: Path, tmp_
     head, (row, worst) = beside(*both)
     assert row[:4] == ["grey", f"{own:.3f}", f"{others:.3f}", f"{others / own:.3f}"]
     assert worst[head.index("times")] == row[3]
+
+
+def test_plots_of_depth_show_a_users_own_sets(oracle: Examiner, tmp_path: Path) -> None:
+    outcome, example = oracle.answer(case(1.0))
+    sets = [summarise(name, "gt", [outcome]) for name in ("desk", "d200", "rgbd view 0.8", "plane 1 m")]
+    write(Report("grey", sets, [], {}, {"desk": example}), tmp_path)
+    for plot in ("calibration", "error_by_certainty"):
+        drawn = (tmp_path / f"{plot}.svg").read_text()
+        assert [name for name in ("desk", "d200", "rgbd", "plane") if f"<!-- {name}" in drawn] == ["desk", "d200"]
 
 
 def _no_picture() -> Iterator[Case]:
