@@ -227,16 +227,26 @@ def fixed_cases() -> Iterator[Case]:
 
 def photographed_cases(folder: Path, count: int) -> Iterator[Case]:
     """Pictures out of focus, each with a camera in ``cameras.json``, as of ``camind blender``; the side is not told."""
-    cameras = json.loads((folder / CAMERAS).read_text())
+    cameras = _cameras(folder)
     for photo in _spread(folder, count):
         height, width = photo.image.shape[:2]
-        told = cameras.get(photo.name, {})
-        if lacking := [name for name in CAMERA_NAMES if name not in told]:
-            raise ValueError(f"{folder / CAMERAS} has no {lacking[0]} of {photo.name}, which {folder / 'color'} has")
+        told = cameras[photo.name]
         inner = Intrinsics.centred(told["fx_px"], width, height) if "fx_px" in told else None
         camera = Camera(width, height, told["focus_distance_m"], told["k_cam_px"], told["gamma_px"], intrinsics=inner)
         blur_px = thin_lens.blur_at_depth(photo.depth_m, camera.focus_distance_m, camera.k_cam_px, camera.gamma_px)
         yield Case(photo.name, photo.image, photo.depth_m, camera, "auto", blur_px)
+
+
+def _cameras(folder: Path) -> dict[str, dict[str, float]]:
+    """What took each picture of a folder, by its stem; ``ValueError`` where that is not said."""
+    cameras: dict[str, dict[str, float]] = json.loads((folder / CAMERAS).read_text())
+    for name in sorted(file.stem for file in (folder / "color").glob("*")):
+        if lacking := [wanted for wanted in CAMERA_NAMES if wanted not in cameras.get(name, {})]:
+            raise ValueError(
+                f"{folder / CAMERAS} has no {lacking[0]} of {name}, which {folder / 'color'} has "
+                f"(sharp frames, as NYU's, are scored in {folder.with_name('rgbd')})"
+            )
+    return cameras
 
 
 def _spread(folder: Path, count: int) -> Iterator[Photo]:
@@ -297,10 +307,15 @@ def trials(data: Path, quick: bool) -> list[Trial]:
 
 
 def photographed_folders(data: Path) -> list[Path]:
-    """Those of a data folder that have a name of their own and cameras of their pictures."""
+    """Those of a data folder that have a name of their own and cameras of their pictures.
+
+    Raises ``ValueError`` for the name of another set, or a picture whose camera is not told.
+    """
     folders = sorted(file.parent for file in data.glob(f"*/{CAMERAS}") if file.parent.name not in SETS)
     if taken := [folder for folder in folders if folder.name.split()[0] in TAKEN]:
         raise ValueError(f"{taken[0]} has the name of another set: name it otherwise")
+    for folder in folders:
+        _cameras(folder)
     return folders
 
 

@@ -101,6 +101,12 @@ def test_own_photographs_are_scored_by_their_cameras(tmp_path: Path) -> None:
         list(photographed_cases(tmp_path / "desk", 1))
 
 
+def test_sharp_frames_under_a_name_of_their_own_are_refused_before_anything_is_scored(tmp_path: Path) -> None:
+    save_photos(tmp_path / "nyu", [(Photo("a", PICTURE, np.ones((48, 64), np.float32)), {"fx_px": 518.9})])
+    with pytest.raises(ValueError, match=f"no focus_distance_m of a.*scored in {tmp_path / 'rgbd'}"):
+        trials(tmp_path, quick=True)
+
+
 def test_a_set_is_not_named_as_one_that_is_drawn(tmp_path: Path) -> None:
     save_photos(tmp_path / "procedural near", [(Photo("a", PICTURE, np.ones((48, 64), np.float32)), {})])
     with pytest.raises(ValueError, match="name it otherwise"):
