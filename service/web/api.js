@@ -241,7 +241,7 @@ export async function everyCamera(options) {
  * `onProgress` gets the part sent, 0 to 1, or null where it is unknown; `onReceived` that of the answer.
  *
  * @typedef {RequestOptions & {onProgress?: (fraction: number | null) => void, onReceived?: (fraction: number | null) => void,
- *   responseType?: XMLHttpRequestResponseType}} UploadOptions
+ *   responseType?: "" | "blob" | "json"}} UploadOptions
  */
 
 /**
@@ -261,7 +261,6 @@ export async function upload(path, options = {}) {
 
 /** @param {unknown} body */
 async function asText(body) {
-	if (body instanceof ArrayBuffer) return new TextDecoder().decode(body);
 	if (body instanceof Blob) return body.text();
 	return typeof body === "string" ? body : JSON.stringify(body);
 }

@@ -82,7 +82,7 @@ function App() {
 	const [said, setSaid] = useState("");
 	const [hasKey, setHasKey] = useState(storedKey() !== null);
 
-	const load = useCallback(async (/** @type {boolean} */ asks) => {
+	const reloadCameras = useCallback(async ({ asks = true } = {}) => {
 		try {
 			setCameras(await everyCamera({ asks }));
 			setProblem(null);
@@ -91,7 +91,6 @@ function App() {
 			if (asks) setProblem(met);
 		}
 	}, []);
-	const reloadCameras = useCallback(() => load(true), []);
 	const announce = useCallback((/** @type {string} */ text) => {
 		// the same words again are said again
 		setSaid((before) => (before === text ? `${text}\u00a0` : text));
@@ -99,7 +98,7 @@ function App() {
 	useEffect(() => {
 		reloadCameras();
 		// some may have been made or changed elsewhere
-		const look = () => document.hidden || load(false);
+		const look = () => document.hidden || reloadCameras({ asks: false });
 		document.addEventListener("visibilitychange", look);
 		return () => document.removeEventListener("visibilitychange", look);
 	}, []);

@@ -96,7 +96,7 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
 		const settings = { pattern: patternOf(sheet), focus_distance_m: focusM, register: false };
 		form.append("settings", JSON.stringify(settings));
 		for (const { role, file } of photos) form.append(role, file, file.name);
-		requestKey.current ||= newKey();
+		requestKey.current ||= crypto.getRandomValues(new Uint32Array(4)).join("-");
 		setProblem(null);
 		setSent(0);
 		try {
@@ -278,8 +278,4 @@ function useJob(job, attempt, setJob, setProblem, onEnd) {
 		follow();
 		return () => stop.abort();
 	}, [live, attempt]);
-}
-
-function newKey() {
-	return [...crypto.getRandomValues(new Uint8Array(16))].map((byte) => byte.toString(16).padStart(2, "0")).join("");
 }

@@ -1,5 +1,6 @@
 /** The depth as points in space. */
 
+import { Switch } from "./colour_controls.js";
 import { html, useEffect, useRef, useState } from "./vendor/preact.js";
 
 /** @typedef {import("./cloud_worker.js").Order} Order */
@@ -87,14 +88,7 @@ export function CloudView({ reader, result, look, hasPhotograph, isShown }) {
 			<button type="button" onClick=${act(["zoom", 1 / ZOOM])} aria-label="Farther">−</button>
 			<button type="button" onClick=${act(["reset"])}>Reset view</button>
 			${hasPhotograph &&
-			html`<label class="choice">
-				<input
-					type="checkbox"
-					checked=${isPhotograph}
-					onChange=${(/** @type {any} */ event) => setIsPhotograph(event.target.checked)}
-				/>
-				Photograph's colours
-			</label>`}
+			html`<${Switch} title="Photograph's colours" isOn=${isPhotograph} onSwitch=${setIsPhotograph} />`}
 		</div>
 		<p id="depth-cloud-hint" class="hint">
 			Drag to turn, wheel or pinch to come nearer. By keys: arrows turn, + and − come nearer and go away, 0 resets.

@@ -68,7 +68,7 @@ function Bound({ title, value, leastM, mostM, onValue }) {
 }
 
 /** @param {{title: string, isOn: boolean, onSwitch: (isOn: boolean) => void}} props */
-function Switch({ title, isOn, onSwitch }) {
+export function Switch({ title, isOn, onSwitch }) {
 	return html`<label class="choice">
 		<input type="checkbox" checked=${isOn} onChange=${(/** @type {any} */ event) => onSwitch(event.target.checked)} />
 		${title}

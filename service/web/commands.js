@@ -9,15 +9,14 @@
  * @property {string} format
  */
 
-/** @type {Record<string, {ending: string, says: string}>} */
 export const FORMATS = {
-	png: { ending: "png", says: "PNG, 16-bit millimetres" },
-	npy: { ending: "npy", says: "NumPy, metres" },
-	npz: { ending: "npz", says: "NumPy, all maps" },
-	tiff: { ending: "tiff", says: "TIFF, float metres" },
-	ply: { ending: "ply", says: "PLY, coloured points" },
-	preview: { ending: "jpg", says: "JPEG, for the eye" },
-	json: { ending: "json", says: "JSON, summary" },
+	png: "PNG, 16-bit millimetres",
+	npy: "NumPy, metres",
+	npz: "NumPy, all maps",
+	tiff: "TIFF, float metres",
+	ply: "PLY, coloured points",
+	preview: "JPEG, for the eye",
+	json: "JSON, summary",
 };
 
 /** @param {Ask} ask @returns {string} path and query, relative to the page */
@@ -32,7 +31,7 @@ export function depthPath({ camera, side, focusM, known, format }) {
 
 /** @param {string} photograph the file's name @param {string} format */
 export function answerName(photograph, format) {
-	return `${photograph.replace(/\.[^.]*$/, "") || "photograph"}-depth.${FORMATS[format].ending}`;
+	return `${photograph.replace(/\.[^.]*$/, "") || "photograph"}-depth.${format === "preview" ? "jpg" : format}`;
 }
 
 /** @typedef {{url: string, photograph: string, mediaType: string, answer: string, hasKey: boolean}} Command */

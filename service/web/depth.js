@@ -316,9 +316,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 							<div
 								id="depth-picture-photograph"
 								class="stack"
-								role=${result ? "tabpanel" : undefined}
-								aria-labelledby=${result ? "depth-tab-photograph" : undefined}
-								hidden=${result !== null && picture !== "photograph"}
+								...${result && { role: "tabpanel", "aria-labelledby": "depth-tab-photograph", hidden: picture !== "photograph" }}
 							>
 								<${Stage}
 									...${{ reader, size, look, reading, marks, measured, known, announce }}

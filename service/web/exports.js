@@ -67,7 +67,7 @@ export function Exports({ result: { asked, file, npz, revision, warnings }, anno
 		<${Choice}
 			label="Format"
 			value=${format}
-			options=${Object.entries(FORMATS).map(([value, { says }]) => [value, says])}
+			options=${Object.entries(FORMATS)}
 			onChange=${(/** @type {string} */ value) => {
 				setFormat(value);
 				setCopied(null);

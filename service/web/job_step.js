@@ -218,10 +218,7 @@ function Outliers({ outliers }) {
 	`;
 }
 
-/**
- * @param {{job: any, cameras: any[] | null, isVague: boolean, onAccepted: (job: any) => void, onDiscard: () => void,
- *   onAgain: () => void, go: import("./app.js").ViewProps["go"]}} props
- */
+/** @param {Parameters<typeof Ended>[0] & {isVague: boolean}} props */
 function Accept({ job, cameras, isVague, onAccepted, onDiscard, onAgain, go }) {
 	const [name, setName] = useState(job.camera);
 	const [problem, setProblem] = useProblem();

@@ -148,10 +148,7 @@ export function Stage(props) {
 			ref=${stage}
 			class=${`depth-stage ${result ? "depth-ready" : ""}`}
 			style=${{ aspectRatio: `${size.width} / ${size.height}`, maxWidth: `calc(78vh * ${size.width / size.height})` }}
-			tabindex=${result ? 0 : undefined}
-			role=${result ? "application" : undefined}
-			aria-label=${result ? "Depth of the photograph" : undefined}
-			aria-describedby=${result ? HINT : undefined}
+			...${result && { tabindex: 0, role: "application", "aria-label": "Depth of the photograph", "aria-describedby": HINT }}
 			onPointerDown=${onPointerDown}
 			onPointerMove=${onPointerMove}
 			onPointerUp=${onPointerUp}
@@ -202,13 +199,7 @@ function Bitmap({ bitmap, name }) {
 /**
  * What is drawn on the picture; it is said in words beside it.
  *
- * @param {{
- *   size: {width: number, height: number},
- *   reading: Reading | null,
- *   marks: Pixel[],
- *   measured: import("./depth.js").Measured | null,
- *   known: import("./tape.js").KnownDepth[],
- * }} props
+ * @param {Pick<Parameters<typeof Stage>[0], "size" | "reading" | "marks" | "measured" | "known">} props
  */
 function Marks({ size, reading, marks, measured, known }) {
 	const x = (/** @type {number} */ u) => `${((100 * (u + 0.5)) / size.width).toFixed(3)}%`;

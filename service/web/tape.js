@@ -35,15 +35,9 @@ export function Tape({ reader, mark, hasPoints, known, onKnown }) {
 		if (mark === null) return;
 		const isStraight = hasPoints && way === "straight";
 		const rayLength = isStraight ? (await reader.ask("at", mark)).rayLength : 1;
-		if (rayLength === null) {
-			setFault("By the camera's distortion no ray meets this pixel.");
-			return;
-		}
+		if (rayLength === null) return setFault("By the camera's distortion no ray meets this pixel.");
 		const depthM = decimal(text) / rayLength;
-		if (!(depthM >= NEAREST_M && depthM <= FARTHEST_M)) {
-			setFault("This is no distance in metres.");
-			return;
-		}
+		if (!(depthM >= NEAREST_M && depthM <= FARTHEST_M)) return setFault("This is no distance in metres.");
 		const others = known.filter(({ u, v }) => u !== mark.u || v !== mark.v);
 		setText("");
 		setFault("");
