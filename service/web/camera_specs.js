@@ -27,9 +27,13 @@ export const SENSOR_WIDTH = "pixels across the full-size photograph the camera t
 /** Times the focus distance: what is nearer or farther has no answer (the model's `depth_ratio`). */
 const ANSWERED = [0.15, 8];
 
+/** What is focused farther is read as by the camera that blurs alike and is focused here. */
+const FARTHEST_FOCUS_M = 5;
+
 /** @param {any} camera as the API reads or previews it @returns {[number, number] | null} where its depths are good, in metres */
 export function usableM({ range_m, focus_distance_m }) {
-	const near = Math.max(range_m.near, ANSWERED[0] * focus_distance_m);
+	const readM = Math.min(focus_distance_m, FARTHEST_FOCUS_M);
+	const near = Math.max(range_m.near, 1 / (1 / (ANSWERED[0] * readM) - 1 / readM + 1 / focus_distance_m));
 	const far = Math.min(range_m.far, ANSWERED[1] * focus_distance_m);
 	return near < far ? [near, far] : null;
 }

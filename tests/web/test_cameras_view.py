@@ -11,6 +11,7 @@ import pytest
 from playwright.sync_api import Dialog, Page, Route, expect
 
 from model_export.served import Server
+from service.optics.thin_lens import depth_at_focus
 from tests.web.steps import OVERFLOW, eventually
 
 JSON = {"Content-Type": "application/json"}
@@ -448,13 +449,21 @@ def test_what_is_typed_is_not_thrown_away_unasked(page: Page, served: Server, ph
 
 
 def test_a_range_ends_where_answers_end(page: Page, served: Server, phone: dict[str, Any]) -> None:
-    nearest, farthest = served.ask("GET", "/model").json()["manifest"]["ranges"]["depth_ratio"]
+    ranges = served.ask("GET", "/model").json()["manifest"]["ranges"]
+    (nearest, farthest), (_, known_m) = ranges["depth_ratio"], ranges["focus_distance_m"]
     strong = phone | {"name": f"{phone['name']}-strong", "k_cam_px": 300.0, "focus_distance_m": 2.0}
     weak = phone | {"name": f"{phone['name']}-weak", "k_cam_px": 0.05, "focus_distance_m": 2.0}
-    for camera in (strong, weak):
+    beyond = phone | {"name": f"{phone['name']}-beyond", "k_cam_px": 300.0, "focus_distance_m": 20.0}
+    for camera in (strong, weak, beyond):
         assert served.add(camera) == 201
     assert read(served, strong["name"])["range_m"]["far"] > farthest * 2
-    for camera, words in ((strong, f"{nearest * 2:g} to {farthest * 2:g} m"), (weak, "none")):
+    # focused farther than the networks know, it is read by the camera that blurs alike
+    begins_m = depth_at_focus(nearest * known_m, known_m, 20.0)
+    for camera, words in (
+        (strong, f"{nearest * 2:g} to {farthest * 2:g} m"),
+        (weak, "none"),
+        (beyond, f"{begins_m:.3g} to {farthest * 20:g} m"),
+    ):
         page.goto(f"#cameras/{camera['name']}")
         expect(page.get_by_role("heading", name=camera["name"])).to_be_visible()
         expect(page.locator(".figures div").filter(has_text="Usable range").get_by_role("definition")).to_have_text(
