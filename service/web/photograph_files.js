@@ -2,7 +2,7 @@
 
 import { getBlob } from "./api.js";
 
-export const PHOTOGRAPHS = "image/*,.heic,.heif,.dng,.cr2,.nef,.arw";
+export const PHOTOGRAPHS = "image/*,.heic,.heif,.hif,.dng,.cr2,.nef,.arw";
 
 /** @param {File} file */
 export function mediaTypeOf(file) {
