@@ -16,7 +16,8 @@ import { html, render, useCallback, useEffect, useRef, useState } from "./vendor
  *
  * @typedef {object} ViewProps
  * @property {boolean} shown whether the view's tab is in front
- * @property {any[] | null} cameras as the API gives them, by name; null while they load
+ * @property {any[] | null} cameras as the API gives them, by name; null before they are there
+ * @property {boolean} lacksCameras whether they could not be had
  * @property {string | null} camera the name in the address, for the view in front
  * @property {() => Promise<void>} reloadCameras
  * @property {(tab: Tab, about?: {camera?: string | null, replaces?: boolean}) => void} go change the tab, and pick the camera
@@ -164,6 +165,7 @@ function App() {
 					<${View}
 						shown=${tab === place.tab}
 						camera=${tab === place.tab ? place.camera : null}
+						lacksCameras=${cameras === null && problem !== null}
 						...${{ cameras, reloadCameras, go, announce }}
 					/>
 				</section>`,

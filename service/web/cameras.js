@@ -19,7 +19,7 @@ const SOURCES = { given: "given", lens: "from lens specs", calibration: "calibra
 const stay = (event) => event.preventDefault();
 
 /** @param {import("./app.js").ViewProps} props */
-export function CamerasView({ shown, cameras, camera, reloadCameras, go, announce }) {
+export function CamerasView({ shown, cameras, lacksCameras, camera, reloadCameras, go, announce }) {
 	const [open, setOpen] = useState(/** @type {Open} */ ({ kind: "none" }));
 	const [file, setFile] = useState(/** @type {File | null} */ (null));
 	const [filter, setFilter] = useState("");
@@ -106,7 +106,7 @@ export function CamerasView({ shown, cameras, camera, reloadCameras, go, announc
 			</div>
 			<div class="cameras">
 				<section class="card" aria-label="List of cameras">
-					${cameras === null && html`<p class="hint">Loading ...</p>`}
+					${cameras === null && html`<p class="hint">${lacksCameras ? "The list did not come." : "Loading ..."}</p>`}
 					${cameras?.length === 0 &&
 					html`<p>There is no camera yet. Make one from its lens specs, or <a href="#calibrate">measure it</a> with a printed sheet.</p>`}
 					${(filter || (cameras?.length ?? 0) > A_PAGE / 2) &&

@@ -58,7 +58,7 @@ const NO_PHOTOGRAPH = /:(invalid-image|unsupported-kind)$/;
 const FIRST_LOOK = { map: "cividis", nearM: 1, farM: 2, hatchesNothing: true, dotsEither: true };
 
 /** @param {import("./app.js").ViewProps} props */
-export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, announce }) {
+export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloadCameras, go, announce }) {
 	const reader = useMemo(() => new DepthReader(), []);
 	const [file, setFile] = useState(/** @type {File | null} */ (null));
 	const [leftOut, setLeftOut] = useState(0);
@@ -89,7 +89,9 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 	/** The camera and revision that was read by before the page knew it. */
 	const ahead = useRef("");
 
-	const camera = cameras?.find((one) => one.name === name) ?? null;
+	// who may not list cameras may still read by one that a link names
+	const listed = cameras ?? (lacksCameras && name ? [{ name }] : []);
+	const camera = listed.find((one) => one.name === name) ?? null;
 	const ask = { camera: name, side, focusM, known };
 
 	useEffect(() => {
@@ -200,7 +202,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 			setPhase(null);
 			if (told.revision !== camera?.revision) {
 				ahead.current = `${name} ${told.revision}`;
-				reloadCameras();
+				if (cameras) reloadCameras();
 			}
 			announce(
 				spread
@@ -245,13 +247,14 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 							aria-invalid=${isNotTheFrame}
 							onChange=${(/** @type {any} */ event) => go("depth", { camera: event.target.value, replaces: true })}
 						>
-							<option value="" disabled>${cameras === null ? "Loading…" : "Choose the camera that took it"}</option>
-							${(cameras ?? []).map((one) => html`<option key=${one.name} value=${one.name}>${one.name}</option>`)}
+							<option value="" disabled selected=${!camera}>${cameras ? "Choose the camera that took it" : lacksCameras ? "The list did not come" : "Loading…"}</option>
+							${listed.map((one) => html`<option key=${one.name} value=${one.name}>${one.name}</option>`)}
 						</select>
 					</label>
-					${camera
+					${cameras &&
+					(camera
 						? html`<p class="hint">${about(camera)}</p>`
-						: name && cameras && html`<p class="notice">There is no camera ${name}.</p>`}
+						: name && html`<p class="notice">There is no camera ${name}.</p>`)}
 					${cameras?.length === 0 &&
 					html`<p class="hint">
 						No camera is stored yet. Give a photograph, and its EXIF drafts one; or${" "}
@@ -264,7 +267,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 					<${TextField}
 						...${{ id: "depth-focus", label: "Focus distance of this shot, m", kind: "decimal", value: focus, onInput: setFocus }}
 						fault=${toMetres(focus) === undefined ? "This is no distance in metres." : ""}
-						hint=${camera ? `Left empty, the camera's: ${short(camera.focus_distance_m, 4)} m.` : ""}
+						hint=${camera && cameras ? `Left empty, the camera's: ${short(camera.focus_distance_m, 4)} m.` : ""}
 						onChange=${(/** @type {string} */ text) => toMetres(text) !== undefined && setFocusM(toMetres(text) ?? null)}
 					/>
 					<${Warnings} texts=${warned("focus")} />
@@ -278,6 +281,7 @@ export function DepthView({ shown, cameras, camera: brought, reloadCameras, go, 
 				onClose=${() => setProblem(null)}
 			/>
 			${isNotTheFrame &&
+			cameras &&
 			!isDrafting &&
 			html`<p>
 				If it is the whole frame of another camera,${" "}

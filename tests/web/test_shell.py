@@ -1,11 +1,12 @@
 """The page's frame in a real browser: tabs, keyboard, API key, accessibility, and a service that goes away."""
 
+import json
 import re
 import signal
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -225,6 +226,28 @@ def test_status_shows_what_the_key_may_see(
         with page.expect_download() as saved:
             page.get_by_role("button", name="Download the API as OpenAPI").click()
         assert '"openapi"' in saved.value.path().read_text()
+
+
+def test_who_may_not_list_cameras_reads_by_the_one_that_a_link_names(
+    browser: Browser, keyed: Keyed, d200: dict[str, Any]
+) -> None:
+    headers = {"Authorization": f"Bearer {keyed.key()}", "Content-Type": "application/json"}
+    assert keyed.server.ask("POST", "/cameras", json.dumps(d200), headers).status == 201
+    with watched(browser, keyed.server.url, [REFUSED, "status of 403"]) as page:
+        page.goto("#cameras")
+        give_key(page, keyed.key("depth"))
+        expect(page.get_by_text("The list did not come.")).to_be_visible()
+        expect(page.get_by_text("Loading")).to_have_count(0)
+        expect(page.locator(".depth-camera option:checked")).to_have_text("The list did not come")
+        page.goto(f"#depth/{d200['name']}")
+        with page.expect_file_chooser() as chooser:
+            page.get_by_role("button", name="Choose a photograph").click()
+        with page.expect_response(lambda answer: "/depth?" in answer.url) as answered:
+            chooser.value.set_files(ROOT / "docs" / "pictures" / "coffee.jpg")
+        assert answered.value.status == 200
+        expect(page.get_by_role("application", name="Depth of the photograph")).to_be_visible()
+        expect(page.get_by_role("alert")).to_have_count(1)  # of the list alone
+    keyed.server.ask("DELETE", f"/cameras/{d200['name']}", headers=headers)
 
 
 def test_a_quota_says_when_to_come_back(browser: Browser, keyed: Keyed) -> None:
