@@ -19,7 +19,7 @@ import { html, render, useCallback, useEffect, useRef, useState } from "./vendor
  * @property {any[] | null} cameras as the API gives them, by name; null before they are there
  * @property {boolean} lacksCameras whether they could not be had
  * @property {string | null} camera the name in the address, for the view in front
- * @property {() => Promise<void>} reloadCameras
+ * @property {(about?: {stored?: any}) => Promise<void>} reloadCameras `stored` is among them even where that fails
  * @property {(tab: Tab, about?: {camera?: string | null, replaces?: boolean}) => void} go change the tab, and pick the camera
  *   there; the way back leads past an address that is replaced
  * @property {(text: string) => void} announce say it to who cannot see it
@@ -83,13 +83,14 @@ function App() {
 	const [said, setSaid] = useState("");
 	const [hasKey, setHasKey] = useState(storedKey() !== null);
 
-	const reloadCameras = useCallback(async ({ asks = true } = {}) => {
+	const reloadCameras = useCallback(async ({ asks = true, stored = /** @type {any} */ (null) } = {}) => {
 		try {
 			setCameras(await everyCamera({ asks }));
 			setProblem(null);
 		} catch (error) {
 			const met = problemOf(error);
 			if (asks) setProblem(met);
+			if (stored) setCameras((before) => before && [...before.filter(({ name }) => name !== stored.name), stored]);
 		}
 	}, []);
 	const announce = useCallback((/** @type {string} */ text) => {

@@ -32,7 +32,7 @@ export function arriveAt(heading) {
 }
 
 /**
- * @param {{editing: any | null, onSaved: (camera: any, words: string) => void, onTyped: () => void, onCancel: () => void}} props
+ * @param {{editing: any | null, onSaved: (words: string, camera: any) => void, onTyped: () => void, onCancel: () => void}} props
  *   `editing` is the camera as it was read, null for a new one
  */
 export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
@@ -66,7 +66,7 @@ export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 		setProblem(null);
 		try {
 			const camera = await storeCamera(bodyOf(fields), revision);
-			onSaved(camera, `Camera ${camera.name} is stored as revision ${camera.revision}.`);
+			onSaved(`Camera ${camera.name} is stored as revision ${camera.revision}.`, camera);
 		} catch (error) {
 			if (!(error instanceof Problem)) throw error;
 			if (error.status === 412) await showTheirs();

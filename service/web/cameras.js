@@ -74,10 +74,10 @@ export function CamerasView({ shown, cameras, lacksCameras, camera, reloadCamera
 		else if (mayLeave()) show(name);
 	}
 
-	/** @param {string | null} name of the camera to show then @param {string} words */
-	async function changed(name, words) {
-		await reloadCameras();
-		show(name);
+	/** @param {string} words @param {any} [stored] the camera to show then */
+	async function changed(words, stored) {
+		await reloadCameras({ stored });
+		show(stored?.name ?? null);
 		announce(words);
 	}
 
@@ -145,7 +145,7 @@ export function CamerasView({ shown, cameras, lacksCameras, camera, reloadCamera
 					html`<${CameraForm}
 						key=${open.kind === "edit" ? open.camera.name : ""}
 						editing=${open.kind === "edit" ? open.camera : null}
-						onSaved=${(/** @type {any} */ stored, /** @type {string} */ words) => changed(stored.name, words)}
+						onSaved=${changed}
 						onTyped=${() => setTyped(true)}
 						onCancel=${() => show(open.kind === "edit" ? open.camera.name : null)}
 					/>`}
@@ -157,7 +157,7 @@ export function CamerasView({ shown, cameras, lacksCameras, camera, reloadCamera
 						opened=${open}
 						go=${go}
 						onEdit=${() => turnTo({ kind: "edit", camera: read })}
-						onDeleted=${() => changed(null, `Camera ${read.name} is deleted.`)}
+						onDeleted=${() => changed(`Camera ${read.name} is deleted.`)}
 						onStale=${reloadCameras}
 					/>`}
 				</div>
@@ -167,7 +167,7 @@ export function CamerasView({ shown, cameras, lacksCameras, camera, reloadCamera
 				file=${file}
 				onClose=${(/** @type {number} */ stored) => {
 					setFile(null);
-					if (stored > 0) changed(null, `${counted(stored, "camera is", "cameras are")} imported.`);
+					if (stored > 0) changed(`${counted(stored, "camera is", "cameras are")} imported.`);
 				}}
 			/>`}
 		</div>

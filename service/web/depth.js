@@ -294,10 +294,10 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 				file=${file}
 				mediaType=${mediaTypeOf(/** @type {File} */ (file))}
 				onFailed=${setFailure}
-				onStored=${async (/** @type {string} */ stored) => {
-					await reloadCameras();
+				onStored=${async (/** @type {any} */ stored) => {
+					await reloadCameras({ stored });
 					setProblem(null);
-					go("depth", { camera: stored, replaces: true });
+					go("depth", { camera: stored.name, replaces: true });
 				}}
 			/>`}
 			${failure &&

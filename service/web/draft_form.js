@@ -15,7 +15,7 @@ const NUMBERS = [
 	["lens/sensor_width_px", "Sensor width (px)", SENSOR_WIDTH],
 ];
 
-/** @param {{file: File, mediaType: string, onStored: (name: string) => Promise<void>,
+/** @param {{file: File, mediaType: string, onStored: (camera: any) => Promise<void>,
  *   onFailed: (why: import("./api.js").Problem) => void}} props */
 export function DraftForm({ file, mediaType, onStored, onFailed }) {
 	const [draft, setDraft] = useState(/** @type {any} */ (null));
@@ -47,7 +47,7 @@ export function DraftForm({ file, mediaType, onStored, onFailed }) {
 		setIsStoring(true);
 		setProblem(null);
 		try {
-			await onStored((await storeCamera(bodyOf(fields), null)).name);
+			await onStored(await storeCamera(bodyOf(fields), null));
 		} catch (error) {
 			setProblem(problemOf(error));
 		} finally {

@@ -152,6 +152,23 @@ def test_a_camera_that_is_not_there_is_said_to_be_missing(page: Page) -> None:
         expect(page.get_by_role("tabpanel").get_by_text("There is no camera nosuch.")).to_be_visible()
 
 
+def test_what_is_stored_is_shown_where_the_list_does_not_come_again(
+    page: Page, served: Server, phone: dict[str, Any], expected_errors: list[str]
+) -> None:
+    expected_errors.append("ERR_FAILED")
+    open_camera(page, served, phone)
+    page.get_by_role("button", name="Edit", exact=True).click()
+    fill(page, {"k_cam (px)": "1.7"})
+    page.route("**/cameras?*", lambda route: route.abort(), times=1)
+    page.get_by_role("button", name="Save as a new revision").click()
+    expect(page.get_by_role("alert")).to_contain_text("The service does not answer.")
+    expect(page.get_by_role("article")).to_contain_text("1.7 px")
+    expect(page.get_by_text("There is no camera")).to_have_count(0)
+    page.get_by_role("button", name="Try again").click()
+    expect(page.get_by_role("alert").filter(visible=True)).to_have_count(0)
+    expect(page.get_by_role("listitem")).to_have_count(1)
+
+
 def test_a_name_that_is_taken_is_told(
     page: Page, served: Server, phone: dict[str, Any], expected_errors: list[str]
 ) -> None:
