@@ -26,7 +26,7 @@ export function ImportDialog({ file, onClose }) {
 
 	useEffect(() => {
 		dialog.current?.showModal();
-		planOf(file).then(setSteps, (error) => setFault(error.detail ?? error.message));
+		planOf(file).then(setSteps, (error) => setFault(`${error.title ?? ""} ${error.message}`));
 	}, []);
 
 	async function carryOut() {
@@ -123,6 +123,7 @@ async function stepDone(step) {
 		const { revision } = await storeCamera(step.camera, step.revision);
 		return { ...step, does: "done", words: `as revision ${revision}` };
 	} catch (error) {
-		return { ...step, does: "refuse", words: problemOf(error).detail };
+		const { title, detail } = problemOf(error);
+		return { ...step, does: "refuse", words: `${title} ${detail}` };
 	}
 }

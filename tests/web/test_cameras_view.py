@@ -340,6 +340,25 @@ def test_what_is_exported_comes_back_after_it_is_shown(
     assert read(served, phone["name"])["k_cam_px"] == 2.5
 
 
+def test_an_import_says_first_that_the_service_does_not_answer(
+    page: Page, phone: dict[str, Any], tmp_path: Path, expected_errors: list[str]
+) -> None:
+    expected_errors.append("ERR_FAILED")
+    file = tmp_path / "cameras.json"
+    file.write_text(json.dumps(phone))
+    page.goto("#cameras")
+    expect(page.get_by_text("There is no camera yet.")).to_be_visible()
+    plan = page.get_by_role("dialog", name="Import cameras")
+    page.route("**/cameras?*", lambda route: route.abort(), times=1)
+    page.get_by_label("Cameras to import").set_input_files(file)
+    expect(plan.get_by_role("alert")).to_have_text(re.compile(r"^\s*The service does not answer\. Check that it runs"))
+    plan.get_by_role("button", name="Cancel").click()
+    page.get_by_label("Cameras to import").set_input_files(file)
+    page.route("**/cameras", lambda route: route.abort(), times=1)
+    plan.get_by_role("button", name="Import 1 camera").click()
+    expect(plan.get_by_role("row", name=phone["name"])).to_contain_text("refused The service does not answer. Check")
+
+
 def test_a_file_that_is_none_is_refused(page: Page, tmp_path: Path) -> None:
     file = tmp_path / "cameras.json"
     file.write_text("metres")
