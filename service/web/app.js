@@ -75,6 +75,10 @@ function useHash() {
 
 function App() {
 	const place = useHash();
+	const at = TABS.findIndex(({ tab }) => tab === place.tab);
+	useEffect(() => {
+		document.title = [place.camera, TABS[at].title, "camind"].filter(Boolean).join(" · ");
+	}, [place]);
 	/** The camera in each tab's address when it was left. */
 	const left = useRef(/** @type {Partial<Record<Tab, string | null>>} */ ({})).current;
 	if (place.tab !== "calibrate") left[place.tab] = place.camera;
@@ -115,7 +119,6 @@ function App() {
 
 	/** @param {KeyboardEvent} event */
 	function onKeyDown(event) {
-		const at = TABS.findIndex(({ tab }) => tab === place.tab);
 		const to = { ArrowLeft: at - 1, ArrowRight: at + 1, Home: 0, End: TABS.length - 1, " ": at }[event.key];
 		if (to === undefined || event.altKey || event.ctrlKey || event.metaKey) return;
 		event.preventDefault();

@@ -79,8 +79,12 @@ def test_tabs_are_addresses(page: Page) -> None:
     page.get_by_role("tab", name="Status").click()
     assert page.url.endswith("#status")
     selected(page, "Status")
+    expect(page).to_have_title("Status · camind")
     page.go_back()
     selected(page, "Cameras")
+    expect(page).to_have_title("Cameras · camind")
+    page.goto("#cameras/two%20words")
+    expect(page).to_have_title("two words · Cameras · camind")
     page.goto("#nowhere/%ff")
     selected(page, "Depth")
 
