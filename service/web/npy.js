@@ -7,7 +7,7 @@ const END_BYTES = 22;
 const MOST_COMMENT_BYTES = 65535;
 const DIRECTORY_ENTRY_BYTES = 46;
 const LOCAL_HEADER_BYTES = 30;
-const MAGIC_BYTES = 8;
+const MAGIC_BYTES = 10;
 /** @type {Record<string, Float32ArrayConstructor | Float64ArrayConstructor | Uint8ArrayConstructor>} */
 const KINDS = { "<f4": Float32Array, "<f8": Float64Array, "|b1": Uint8Array, "|u1": Uint8Array };
 
@@ -47,16 +47,14 @@ async function readEntry(file, header, bytes) {
 /** @param {ArrayBuffer} buffer @returns {NumpyArray} */
 function readNpy(buffer) {
 	const view = new DataView(buffer);
-	if (textOf(view, 1, 5) !== "NUMPY") throw new Error("This is no npy.");
-	const isFirstVersion = view.getUint8(6) === 1;
-	const start = MAGIC_BYTES + (isFirstVersion ? 2 : 4);
-	const length = isFirstVersion ? view.getUint16(8, true) : view.getUint32(8, true);
-	const header = textOf(view, start, length);
+	if (textOf(view, 1, 6) !== "NUMPY\x01") throw new Error("This is no npy of version 1.");
+	const length = view.getUint16(8, true);
+	const header = textOf(view, MAGIC_BYTES, length);
 	const kind = /'descr': '([^']+)'/.exec(header)?.[1] ?? "";
 	const sizes = /'shape': \(([^)]*)\)/.exec(header)?.[1] ?? "";
 	if (!(kind in KINDS) || !header.includes("'fortran_order': False")) throw new Error(`npy of ${kind} cannot be read.`);
 	// NumPy pads the header so that the numbers begin at a multiple of 64 bytes
-	return { data: new KINDS[kind](buffer, start + length), shape: (sizes.match(/\d+/g) ?? []).map(Number) };
+	return { data: new KINDS[kind](buffer, MAGIC_BYTES + length), shape: (sizes.match(/\d+/g) ?? []).map(Number) };
 }
 
 /** @param {DataView} view @param {number} start @param {number} length */
