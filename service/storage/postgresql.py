@@ -7,8 +7,10 @@ from typing import Any, TypeVar
 import psycopg
 from psycopg.abc import PQGen
 from psycopg.pq import TransactionStatus
-from sqlalchemy import URL, Connection, Dialect, Engine, event
+from sqlalchemy import URL, Connection, Dialect, Engine, ExceptionContext, event
 from sqlalchemy.pool import ConnectionPoolEntry
+
+from service.storage.engine import POSTGRESQL_READ_ONLY
 
 LOCK_TIMEOUT_MS = 5_000
 STATEMENT_TIMEOUT_MS = 8_000
@@ -50,8 +52,9 @@ def connect_args(url: URL) -> dict[str, Any]:
 
 
 def bound(engine: Engine) -> None:
-    """Let the engine make ``BoundedConnection``s."""
+    """Let the engine make ``BoundedConnection``s, and new ones where those there are take no writes."""
     event.listen(engine, "do_connect", _connect)
+    event.listen(engine, "handle_error", _leave_read_only)
 
 
 @contextmanager
@@ -76,3 +79,9 @@ def _connect(
     connection = BoundedConnection.connect(*arguments, **parameters)
     connection.answer_timeout_s = ANSWER_TIMEOUT_S
     return connection
+
+
+def _leave_read_only(context: ExceptionContext) -> None:
+    # a session stays what it began as, though its server has become the one that takes writes, or another one has
+    if getattr(context.original_exception, "sqlstate", None) == POSTGRESQL_READ_ONLY:
+        context.is_disconnect = True

@@ -118,14 +118,33 @@ def test_a_table_that_stays_locked_is_busy(hurried: Engine) -> None:
 
 def test_a_server_that_only_reads_takes_no_writes(hurried: Engine) -> None:
     schema.upgrade(hurried)
-    with hurried.begin() as connection:
-        connection.exec_driver_sql(
-            "ALTER DATABASE " + str(hurried.url.database) + " SET default_transaction_read_only = on"
-        )
+    only_read(hurried, "on")
     hurried.dispose()
     with pytest.raises(NotReady, match="takes no writes"):
         require_writable(hurried)
     assert Cameras(hurried).page(1) == ([], False)
+
+
+def test_a_server_that_takes_writes_again_gets_them(hurried: Engine) -> None:
+    """As after a failover: what the pool holds began while the server only read, and stays so."""
+    schema.upgrade(hurried)
+    only_read(hurried, "on")
+    hurried.dispose()
+    with hurried.connect() as one, hurried.connect() as two:
+        assert [each.exec_driver_sql("SHOW transaction_read_only").scalar() for each in (one, two)] == ["on", "on"]
+    only_read(hurried, "off")
+    with pytest.raises(NotReady, match="takes no writes"):
+        require_writable(hurried)
+    for _ in range(3):
+        require_writable(hurried)
+
+
+def only_read(engine: Engine, setting: str) -> None:
+    """Let sessions that begin from now on only read, or write again."""
+    with engine.connect() as connection, connection.begin():
+        connection.exec_driver_sql("SET TRANSACTION READ WRITE")
+        database = engine.url.database
+        connection.exec_driver_sql(f"ALTER DATABASE {database} SET default_transaction_read_only = {setting}")
 
 
 def test_a_statement_that_takes_too_long_is_busy(hurried: Engine) -> None:
