@@ -25,6 +25,7 @@ from service.storage.disk import sync_folder, try_lock, write_through
 from service.storage.engine import SQLITE_DAMAGED, open_engine
 
 BUSY_TIMEOUT_S = 30.0
+READ_BYTES = 1 << 20
 # what SQLite keeps beside a database; of another database they would be played into it
 SIDE_FILES = ("-journal", "-wal", "-shm")
 # what only writing can end with
@@ -71,7 +72,10 @@ def using(database_url: str | URL) -> Iterator[None]:
 
 def require_sound(database: Path) -> None:
     """Read the whole file, if there is one. Raises ``DatabaseFileError`` where it is damaged."""
-    damage = _damage(database) if database.exists() else None
+    if not database.exists():
+        return
+    _read_ahead(database)
+    damage = _damage(database)
     if damage is not None:
         raise DatabaseFileError(
             f"The database {database} is damaged ({damage}): put a backup in its place with `camind restore FILE`."
@@ -189,6 +193,16 @@ def _copied(source: Path, draft: Path, target: Path) -> Contents:
     if damage is not None:
         raise DatabaseFileError(f"{source} is damaged ({damage}): nothing was changed.")
     return _contents(draft)
+
+
+def _read_ahead(file: Path) -> None:
+    """Read a file from front to back, so that SQLite, which goes to and fro in it by pages, need not ask the disk.
+
+    No connection of this process may have it open: SQLite's locks end with the first descriptor that is closed.
+    """
+    with suppress(OSError), file.open("rb", buffering=0) as whole:  # SQLite says it better
+        while whole.read(READ_BYTES):
+            pass
 
 
 def _damage(file: Path) -> str | None:
