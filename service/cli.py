@@ -13,7 +13,7 @@ import typer
 from sqlalchemy import Engine
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.config import Settings, SettingsError, load_settings
+from service.config import DATABASE_FILE, Settings, SettingsError, load_settings
 from service.errors import BadRequest, CamindError, Conflict, NotFound
 from service.memory import end_uncollected, lasting
 from service.principal import EVERYDAY, LOCAL, SCOPES
@@ -126,19 +126,36 @@ def restore(
 ) -> None:
     """Put a backup in the SQLite database's place, at the newest schema; no service may use it meanwhile.
 
-    The database that was there is kept beside it under a dated name. Calibrations whose photographs are in another data
-    folder than this one fail.
+    The database that was there is kept beside it under a dated name. Where CAMIND_DATABASE_URL is an empty PostgreSQL
+    database, after `camind migrate`, the backup's rows go there: that is how to change from SQLite; what pg_dump wrote
+    is for pg_restore. Calibrations whose photographs are in another data folder than this one fail.
     """
+    from service.storage.backup import database_file
     from service.storage.backup import restore as put_back
     from service.storage.spool import known_id
 
     settings = _settings()
-    database = _database_file(settings)
+    database = database_file(settings.effective_database_url)
     with _plain_failures():
+        if database is None:
+            _move(file, settings)
+            return
         contents, kept = put_back(file, database, known_id(settings.spool_dir))
     typer.echo(f"{database} holds {contents}")
     if kept is not None:
         typer.echo(f"What was there before is {kept}")
+
+
+def _move(file: Path, settings: Settings) -> None:
+    from service.storage.move import move
+    from service.storage.spool import known_id
+
+    def tell(done: int, total: int) -> None:
+        typer.echo(f"\r{done} of {total} rows", nl=done == total, err=True)
+
+    with _ready_engine() as engine:
+        contents = move(file, engine, settings.data_dir.resolve() / DATABASE_FILE, known_id(settings.spool_dir), tell)
+    typer.echo(f"The PostgreSQL database holds {contents}")
 
 
 @app.command()

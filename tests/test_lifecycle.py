@@ -146,11 +146,10 @@ def test_a_running_service_is_backed_up_and_not_restored(server: Server, tmp_pat
     assert [line.split("\t")[0] for line in camind("cameras", "list").stdout.splitlines()] == ["kept"]
 
 
-@pytest.mark.parametrize("command", ["backup", "restore"])
-def test_postgresql_has_its_own_commands(tmp_path: Path, command: str) -> None:
+def test_postgresql_has_its_own_commands(tmp_path: Path) -> None:
     environment = {**os.environ, "CAMIND_DATABASE_URL": "postgresql+psycopg://nobody@/none"}
     done = subprocess.run(
-        [CAMIND, command, tmp_path / "x"], env=environment, capture_output=True, text=True, check=False
+        [CAMIND, "backup", tmp_path / "x"], env=environment, capture_output=True, text=True, check=False
     )
     assert done.returncode == 2
     assert "pg_dump and pg_restore" in done.stderr

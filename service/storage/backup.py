@@ -106,19 +106,28 @@ def restore(source: Path, database: Path, spool: str | None = None) -> tuple[Con
     Raises ``DatabaseFileError`` where the backup is damaged, is none of this service's or of a later version's, and
     while the database is used.
     """
-    if not source.is_file():
-        raise DatabaseFileError(f"There is no backup at {source}.")
-    if database.exists() and source.samefile(database):
+    if database.exists() and source.exists() and source.samefile(database):
         raise DatabaseFileError(f"{source} is the database itself: name a backup.")
-    with _replacing(database), _draft_beside(database) as draft:
-        _require_known(_copied(source, draft, database), source)
-        _make_ready(draft, spool)
-        contents = _contents(draft)
+    with newest(source, database, spool) as (draft, contents):
         kept = _keep(database)
         if kept is not None:
             _take_owner(draft, kept)
         _put_in_place(draft, database)
     return contents, kept
+
+
+@contextmanager
+def newest(source: Path, database: Path, spool: str | None) -> Iterator[tuple[Path, Contents]]:
+    """A copy of a backup at the newest schema, beside the database that nobody uses meanwhile; gone afterwards.
+
+    Calibrations that have not ended, and raised errors: as ``restore``.
+    """
+    if not source.is_file():
+        raise DatabaseFileError(f"There is no backup at {source}.")
+    with _replacing(database), _draft_beside(database) as draft:
+        _require_known(_copied(source, draft, database), source)
+        _make_ready(draft, spool)
+        yield draft, _contents(draft)
 
 
 def _lock_file(database: Path) -> Path:
