@@ -240,6 +240,8 @@ def photographed_cases(folder: Path, count: int) -> Iterator[Case]:
 def _cameras(folder: Path) -> dict[str, dict[str, float]]:
     """What took each picture of a folder, by its stem; ``ValueError`` where that is not said."""
     cameras: dict[str, dict[str, float]] = json.loads((folder / CAMERAS).read_text())
+    if not isinstance(cameras, dict):
+        raise ValueError(f"{folder / CAMERAS} must be a JSON object of cameras by their pictures' names")
     for name in sorted(file.stem for file in (folder / "color").glob("*")):
         if lacking := [wanted for wanted in CAMERA_NAMES if wanted not in cameras.get(name, {})]:
             raise ValueError(
@@ -312,8 +314,8 @@ def photographed_folders(data: Path) -> list[Path]:
     Raises ``ValueError`` for the name of another set, or a picture whose camera is not told.
     """
     folders = sorted(file.parent for file in data.glob(f"*/{CAMERAS}") if file.parent.name not in SETS)
-    if taken := [folder for folder in folders if folder.name.split()[0] in TAKEN]:
-        raise ValueError(f"{taken[0]} has the name of another set: name it otherwise")
+    if taken := [folder for folder in folders if folder.name in TAKEN or " " in folder.name]:
+        raise ValueError(f"{taken[0]} has the name of another set, or a space in it: name it otherwise")
     for folder in folders:
         _cameras(folder)
     return folders
