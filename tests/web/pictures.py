@@ -126,10 +126,10 @@ def simulated_photographs() -> list[FilePayload]:
 
 
 PICTURES = (
-    Picture("depth.jpg", "depth", depth, width_px=1120, height_px=820),
-    Picture("depth-dark.jpg", "depth", depth, scheme="dark", width_px=1120, height_px=820),
+    Picture("depth.jpg", "depth", depth, width_px=1120, height_px=860),
+    Picture("depth-dark.jpg", "depth", depth, scheme="dark", width_px=1120, height_px=860),
     Picture("depth-narrow.jpg", "depth", depth, width_px=360, height_px=1100),
-    Picture("depth-3d.jpg", "depth", depth_3d, width_px=1120, height_px=820),
+    Picture("depth-3d.jpg", "depth", depth_3d, width_px=1120, height_px=860),
     Picture("cameras.png", "cameras", cameras),
     Picture("calibrate.jpg", "calibrate", photographs, height_px=1200),
     Picture("calibration.jpg", "calibrate", calibration, height_px=1200),
