@@ -1,4 +1,4 @@
-"""DefocusNet's focal stacks (Maximov et al. 2020): ``XXXXXX_YYAll.tif``, and ``XXXXXXDpt.exr`` in metres."""
+"""DefocusNet's focal stacks (Maximov et al. 2020): ``NNNNNN_NNAll.tif``, and ``NNNNNNDpt.exr`` in metres."""
 
 import re
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ def shots(folder: Path) -> Iterator[Shot]:
     """Every picture of every stack. Raises ``ValueError`` if there is none, or of another focus, ``OSError``."""
     pictures = [found for path in sorted(folder.glob("*All.tif")) if (found := PICTURE.fullmatch(path.name))]
     if not pictures:
-        raise ValueError(f"no XXXXXX_YYAll.tif in {folder}")
+        raise ValueError(f"no NNNNNN_NNAll.tif in {folder}")
     for found in pictures:
         stack, number = found[1], int(found[2])
         if number >= len(FOCUS_DISTANCES_M):
