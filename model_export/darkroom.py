@@ -37,6 +37,7 @@ from model_export.scenes import (
     log_uniform,
 )
 from service.optics import thin_lens
+from service.optics.light import encode_srgb
 
 AGAIN = (0.5, 1.25)  # k_cam of another shot of a scene, of the first one's
 LEAST_MARGIN_PX = 16
@@ -165,12 +166,6 @@ def _through_mosaic(linear: Tensor) -> Tensor:
     return functional.conv2d(functional.pad(seen, (1,) * 4, mode="reflect"), around, groups=3)
 
 
-def _encoded(linear: Tensor) -> Tensor:
-    """Linear light to sRGB (IEC 61966-2-1)."""
-    clipped = linear.clamp(0, 1)
-    return torch.where(clipped <= 0.0031308, clipped * 12.92, 1.055 * clipped.clamp_min(1e-4) ** (1 / 2.4) - 0.055)
-
-
 @lru_cache
 def _cosines(device: torch.device) -> Tensor:
     """The orthonormal cosine transform of a block's side [8,8]."""
@@ -237,7 +232,7 @@ def develop(
     picture = picture + grains * (shot * picture.clamp_min(0) + read).sqrt()
     picture = torch.where(mosaic > 0, _through_mosaic(picture.clamp(0, 2)), picture)
     picture = picture * sent(rng.uniform(0.85, 1.15, (n, 3, 1, 1)).astype(np.float32), device)
-    encoded = _encoded(picture)
+    encoded = encode_srgb(picture)
     encoded = encoded + bend * (encoded**2 * (3 - 2 * encoded) - encoded)
     soft = _soften(encoded, np.array([sharpening.spread_px for sharpening in sharpenings]), 6)
     pixels = ((encoded + sharp * (encoded - soft)).clamp(0, 1) * 255).round()
