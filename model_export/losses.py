@@ -8,13 +8,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from model_export.config import TrainConfig
-from model_export.networks import (
-    SPREAD_BOUNDS,
-    BlurEstimate,
-    DepthEstimate,
-    Pair,
-    Scene,
-)
+from model_export.networks import BlurEstimate, DepthEstimate, Pair, Scene
+from service.inference.artifact import BLUR_ERROR_RANGE
 from service.optics import thin_lens
 
 DEFOCUS_FLOOR_PX = 0.05
@@ -86,7 +81,7 @@ def laplace(error: Tensor, log_scale: Tensor) -> Tensor:
 def correct(blur: BlurEstimate, gamma_px: Tensor, k_cam_px: Tensor, floor_px: float) -> tuple[Tensor, Tensor]:
     """Relative defocus and its spread from the blur network's answer: what happens between the two graphs."""
     gamma, k_cam = gamma_px[:, None, None, None], k_cam_px[:, None, None, None]
-    error = torch.exp(blur.log_error).clamp(*SPREAD_BOUNDS)
+    error = torch.exp(blur.log_error).clamp(*BLUR_ERROR_RANGE)
     x = thin_lens.relative_defocus_from_blur(blur.blur_px, gamma, k_cam, floor_px)
     spread = thin_lens.relative_defocus_spread(blur.blur_px, error, gamma, k_cam, floor_px)
     return x, spread

@@ -21,7 +21,6 @@ from model_export.config import Kind
 MULTIPLE = 16
 BLUR_BOUNDS_PX = (0.2, 60.0)
 LOG_ERROR_BOUNDS = (-5.0, 1.5)
-SPREAD_BOUNDS = (0.01, 2.0)
 RATIO_BOUND = 3.5
 # A network draws towards focus what is little out of it, however well its blur is read. Plain inversion tells where its
 # variance, so many times, is below the network's (odds grow with this power of their ratio), and both are hardly apart

@@ -30,6 +30,7 @@ BLUR_OUTPUTS = ("blur_px", "blur_log_error")
 DEPTH_INPUTS = ("relative_defocus", "relative_defocus_spread", "focus_distance_m", "focal_length_px", "side")
 DEPTH_OUTPUTS = ("log_ratio_near", "log_ratio_far", "p_near", "log_scale")
 LAYOUT_MAP, LAYOUT_ODDS = "layout_map", "layout_odds"
+BLUR_ERROR_RANGE = (0.01, 2.0)  # that relative errors of blur are held within before the depth graph sees them
 
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]

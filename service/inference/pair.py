@@ -13,7 +13,15 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from service.inference.artifact import BLUR_OUTPUTS, DEPTH_OUTPUTS, LAYOUT_MAP, LAYOUT_ODDS, Manifest, ModelFolder
+from service.inference.artifact import (
+    BLUR_ERROR_RANGE,
+    BLUR_OUTPUTS,
+    DEPTH_OUTPUTS,
+    LAYOUT_MAP,
+    LAYOUT_ODDS,
+    Manifest,
+    ModelFolder,
+)
 from service.inference.cancellation import Cancellation
 from service.inference.layout import add_odds, shrunk
 from service.inference.session import Graph
@@ -24,9 +32,7 @@ from service.optics.camera import Camera
 Side = Literal["auto", "near", "far"]
 SIDE_HINTS: dict[Side, float] = {"auto": 0.0, "near": -1.0, "far": 1.0}
 SIDE_RANGES: dict[Side, tuple[float, float]] = {"auto": (0.0, np.inf), "near": (0.0, 1.0), "far": (1.0, np.inf)}  # z/s1
-BLUR_ERROR_RANGE = (0.01, 2.0)
 MAPS = BLUR_OUTPUTS + DEPTH_OUTPUTS
-
 REMEMBERED = 4
 
 RawMaps = dict[str, NDArray[np.float32]]
