@@ -1,6 +1,5 @@
 """How right a calibration is: simulated cameras with known constants, and the paper's own protocol for both methods."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -117,7 +116,7 @@ def paper_row(number: float, method: Method, trial: Trial) -> list[str]:
         return [*head, "", "", trial.report.problem or ""]
     ratio = found.k_cam_px.value / trial.camera.k_cam_px
     blurred = [
-        s.blur_px / math.hypot(trial.camera.k_cam_px * abs(PAPER_FOCUS_M / s.depth_m - 1), trial.camera.gamma_px)
+        s.blur_px / thin_lens.blur_at_depth(s.depth_m, PAPER_FOCUS_M, trial.camera.k_cam_px, trial.camera.gamma_px)
         for s in found.samples
         if s.image.startswith("defocused")
     ]

@@ -24,8 +24,6 @@ from model_export.render import GAUSSIAN, Numbers, Spreads, blur_varying, transf
 from model_export.scenes import (
     GRAIN,
     GRAINY_SHARE,
-    MOSAIC_SHARE,
-    MOSAIC_VARIANCE,
     PLAIN_SHARE,
     READ_NOISE,
     RESCALED_SHARE,
@@ -35,6 +33,8 @@ from model_export.scenes import (
     Shot,
     draw_spread,
     log_uniform,
+    rest_of_gamma,
+    softest_gamma_px,
 )
 from service.optics import thin_lens
 from service.optics.light import encode_srgb
@@ -75,8 +75,7 @@ def retake(rng: np.random.Generator, negative: Negative, config: TrainConfig) ->
     """The shot of a negative by another camera: a lens and softness of its own, and about the same k_cam."""
     shot, scenes = negative.shot, config.scenes
     k_cam_px = float(np.clip(shot.k_cam_px * log_uniform(rng, AGAIN), *scenes.k_cam_px))
-    softest = math.sqrt(thin_lens.PIXEL_BOX_VARIANCE + negative.softness)
-    gamma_px = max(log_uniform(rng, scenes.gamma_px), softest)
+    gamma_px = max(log_uniform(rng, scenes.gamma_px), softest_gamma_px(negative.softness))
     return replace(shot, k_cam_px=k_cam_px, gamma_px=gamma_px, spread=draw_spread(rng, k_cam_px))
 
 
@@ -266,12 +265,11 @@ def photograph(
     sharpenings = [Sharpening.draw(rng) for _ in shots]
     rests, mosaics, told = [], [], []
     for negative, shot, sharpening in zip(negatives, shots, sharpenings, strict=True):
-        softest = math.sqrt(thin_lens.PIXEL_BOX_VARIANCE + negative.softness)
-        gamma_px = max(thin_lens.gamma_before_averaging(shot.gamma_px, taken_px, size), softest)
-        before_px = thin_lens.blur_before_sharpening(gamma_px, sharpening.amount, sharpening.spread_px)
-        variance = before_px**2 - thin_lens.PIXEL_BOX_VARIANCE - negative.softness
-        mosaics.append(variance > MOSAIC_VARIANCE and rng.random() < MOSAIC_SHARE)
-        rests.append(math.sqrt(max(variance - mosaics[-1] * MOSAIC_VARIANCE, 0.0)))
+        before_px = thin_lens.gamma_before_averaging(shot.gamma_px, taken_px, size)
+        gamma_px = max(before_px, softest_gamma_px(negative.softness))
+        rest_px, through_mosaic = rest_of_gamma(rng, gamma_px, negative.softness, sharpening)
+        rests.append(rest_px)
+        mosaics.append(through_mosaic)
         told.append(
             replace(
                 shot,

@@ -319,7 +319,7 @@ def refocus(image: NDArray[np.float32], depth_m: NDArray[np.float32], camera: Ca
     already.
     """
     signed = thin_lens.signed_defocus(depth_m, camera.focus_distance_m) * camera.k_cam_px
-    sigma = thin_lens.defocus_at_depth(depth_m, camera.focus_distance_m, camera.k_cam_px)
+    sigma = np.abs(signed)
     margin = math.ceil(DISC.reach_px(float(sigma.max())) + GAUSSIAN.reach_px(camera.gamma_px)) + 1
     margin = min(margin, min(depth_m.shape) - 1)
     height, width = depth_m.shape

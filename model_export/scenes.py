@@ -288,6 +288,25 @@ class Sharpening:
         return cls(amount, spread_px) if rng.random() < SHARPENED_SHARE else cls()
 
 
+def softest_gamma_px(softness: float) -> float:
+    """gamma of surfaces as they are, ``softness`` (px^2) beside their pixels' box: no picture of them is sharper."""
+    return math.sqrt(thin_lens.PIXEL_BOX_VARIANCE + softness)
+
+
+def rest_of_gamma(
+    rng: np.random.Generator, gamma_px: float, softness: float, sharpening: Sharpening
+) -> tuple[float, bool]:
+    """What a lens adds to gamma, a standard deviation in px, and whether the sensor has a mosaic.
+
+    gamma is what the picture shows in the end: what the surfaces have of it (``softness``, a variance in px^2), a
+    mosaic adds and a sharpening takes away is made up for.
+    """
+    before_px = thin_lens.blur_before_sharpening(gamma_px, sharpening.amount, sharpening.spread_px)
+    variance = before_px**2 - thin_lens.PIXEL_BOX_VARIANCE - softness
+    through_mosaic = variance > MOSAIC_VARIANCE and rng.random() < MOSAIC_SHARE
+    return math.sqrt(max(variance - through_mosaic * MOSAIC_VARIANCE, 0.0)), through_mosaic
+
+
 def develop(
     rng: np.random.Generator, linear: Map, config: SceneConfig, sharpening: Sharpening, *, through_mosaic: bool
 ) -> NDArray[np.uint8]:
@@ -337,8 +356,7 @@ def _frame_layers(
     most = float(np.quantile(np.abs(excess), MOSTLY))
     k_cam_px = max(config.k_cam_px[0], min(shot.k_cam_px, config.defocus_px[1] / max(most, 1e-6)))
     layers, _ = sliced(light, -excess * np.float32(k_cam_px))
-    # no camera's picture of it is sharper than it is itself
-    gamma_px = max(shot.gamma_px, math.sqrt(thin_lens.PIXEL_BOX_VARIANCE + softness))
+    gamma_px = max(shot.gamma_px, softest_gamma_px(softness))
     shot = replace(
         shot, k_cam_px=k_cam_px, gamma_px=gamma_px, focus_distance_m=focus_m, focal_length_px=focal_length_px, side=0
     )
@@ -400,20 +418,13 @@ def _photograph(
     excesses: Map,
     softness: float = 0.0,
 ) -> tuple[NDArray[np.uint8], NDArray[np.float16]]:
-    """Picture uint8 [3,h,w] and q - 1 [h,w] of surfaces, nearest first, taken so.
-
-    gamma is what the picture shows in the end: what the surfaces have of it (``softness``, a variance in px^2), their
-    mosaic adds and a sharpening takes away is made up for by the lens.
-    """
+    """Picture uint8 [3,h,w] and q - 1 [h,w] of surfaces, nearest first, taken so."""
     linear, front = render_layers(layers, shot.spread)
     seen = np.take_along_axis(excesses, front.numpy()[None], 0)[0]
     sharpening = Sharpening.draw(rng)
-    before_px = thin_lens.blur_before_sharpening(shot.gamma_px, sharpening.amount, sharpening.spread_px)
-    variance = before_px**2 - thin_lens.PIXEL_BOX_VARIANCE - softness
-    through_mosaic = variance > MOSAIC_VARIANCE and rng.random() < MOSAIC_SHARE
-    rest = math.sqrt(max(variance - through_mosaic * MOSAIC_VARIANCE, 0.0))
+    rest_px, through_mosaic = rest_of_gamma(rng, shot.gamma_px, softness, sharpening)
     inner = slice(config.margin_px, config.margin_px + config.size_px)
-    light = np.ascontiguousarray(blur(linear, rest)[:, inner, inner].permute(1, 2, 0).numpy())
+    light = np.ascontiguousarray(blur(linear, rest_px)[:, inner, inner].permute(1, 2, 0).numpy())
     pixels = develop(rng, light, config, sharpening, through_mosaic=through_mosaic)
     return np.ascontiguousarray(pixels.transpose(2, 0, 1)), seen[inner, inner].astype(np.float16)
 
