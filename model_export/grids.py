@@ -101,15 +101,9 @@ def draw_pose(
 def project(camera: GridCamera, pose: GridPose, grid: CircleGrid) -> Array:
     """The circles' centres [n, 2] in the picture, px."""
     board = np.column_stack([grid.points_mm(), np.zeros(grid.rows * grid.columns)]) / 1e3
-    matrix, distortion = _matrix(camera), np.array(camera.intrinsics.distortion)
-    return np.asarray(cv2.projectPoints(board, pose.turn, pose.shift_m, matrix, distortion)[0], np.float64).reshape(
-        -1, 2
-    )
-
-
-def _matrix(camera: GridCamera) -> Array:
-    inner = camera.intrinsics
-    return np.array([[inner.fx_px, 0, inner.cx_px], [0, inner.fy_px, inner.cy_px], [0, 0, 1]])
+    matrix, distortion = np.array(camera.intrinsics.matrix), np.array(camera.intrinsics.distortion)
+    seen = cv2.projectPoints(board, pose.turn, pose.shift_m, matrix, distortion)[0]
+    return np.asarray(seen, np.float64).reshape(-1, 2)
 
 
 def photograph(
@@ -125,8 +119,8 @@ def photograph(
     places_mm = on_sheet[:, :2].reshape(height, width, 2) * 1e3
     light = torch.from_numpy(_printed(pose, grid, places_mm, camera.gamma_px)[None])
     if not focused:
-        signed = thin_lens.signed_defocus(depth_m, camera.focus_distance_m) * camera.k_cam_px
-        sigma_px = torch.from_numpy(np.abs(signed).astype(np.float32))
+        defocus_px = thin_lens.defocus_at_depth(depth_m, camera.focus_distance_m, camera.k_cam_px)
+        sigma_px = torch.from_numpy(defocus_px.astype(np.float32))
         light = blur_varying(light[None], sigma_px[None], Spreads.of([camera.spread]), ratio=LEVEL_RATIO)[0]
     inner = light[0].numpy()[margin : margin + camera.height_px, margin : margin + camera.width_px]
     v, u = np.indices(inner.shape)
@@ -163,7 +157,8 @@ def sweep(rng: np.random.Generator, camera: GridCamera, grid: CircleGrid, count:
 
 def _sight(camera: GridCamera, pixels: Array) -> Array:
     """Directions [n, 3] with z = 1 of pixels [n, 2]."""
-    flat = cv2.undistortPoints(pixels[:, None], _matrix(camera), np.array(camera.intrinsics.distortion))
+    matrix, distortion = np.array(camera.intrinsics.matrix), np.array(camera.intrinsics.distortion)
+    flat = cv2.undistortPoints(pixels[:, None], matrix, distortion)
     return np.column_stack([np.asarray(flat).reshape(-1, 2), np.ones(len(pixels))])
 
 

@@ -111,8 +111,7 @@ def stand(grid: CircleGrid, view: View, intrinsics: Intrinsics) -> tuple[float, 
     Neither where no pose fits the circles.
     """
     flat = np.column_stack([grid.points_mm(), np.zeros(grid.rows * grid.columns)])
-    matrix = np.array([[intrinsics.fx_px, 0, intrinsics.cx_px], [0, intrinsics.fy_px, intrinsics.cy_px], [0, 0, 1]])
-    distortion = np.array(intrinsics.distortion, np.float64)
+    matrix, distortion = np.array(intrinsics.matrix), np.array(intrinsics.distortion, np.float64)
     try:
         is_placed, turn, shift = cv2.solvePnP(
             flat[view.circles], np.asarray(view.centres_px, np.float64)[:, None], matrix, distortion

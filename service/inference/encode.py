@@ -23,6 +23,7 @@ from service.inference.png import grey_png
 from service.inference.preview import render_preview
 from service.inference.resampling import bands
 from service.opencv import cv2
+from service.optics.camera import Intrinsics
 
 MILLIMETRE = 0.001
 LARGEST_MILLIMETRES = 65535
@@ -34,6 +35,7 @@ LENS_CELL_PX, MOST_OFF_PX = 8, 0.5
 PERCENTILES = (0, 5, 50, 95, 100)
 GDAL_NODATA = (42113, "s", 0, "nan", True)  # the tag by which GDAL knows what is no answer
 COMMENT_LETTERS = 200  # what reads PLY takes lines of 1,000 or so
+UNKNOWN = Intrinsics(math.nan, math.nan, math.nan, math.nan)
 MapName = Literal["depth_m", "depth_alt_m", "p_near", "sigma_m", "blur_px", "valid"]
 MAPS: tuple[MapName, ...] = get_args(MapName)
 MEDIA_TYPES: dict[str, str] = {
@@ -224,9 +226,7 @@ ENCODERS: dict[str, Callable[[DepthMap, Beside], Encoded]] = {
 
 def camera_matrix(answer: DepthMap) -> NDArray[np.float64]:
     """K [3, 3] at the photograph's size; NaN for the four numbers of unknown intrinsics."""
-    known = answer.camera.intrinsics
-    fx, fy, cx, cy = (known.fx_px, known.fy_px, known.cx_px, known.cy_px) if known else (math.nan,) * 4
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
+    return np.array((answer.camera.intrinsics or UNKNOWN).matrix)
 
 
 def _distortion(answer: DepthMap) -> NDArray[np.float64]:

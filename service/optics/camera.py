@@ -56,6 +56,11 @@ class Intrinsics:
         """Square pixels, the axis in the middle of the picture, no distortion."""
         return cls(fx_px, fx_px, (width_px - 1) / 2, (height_px - 1) / 2)
 
+    @property
+    def matrix(self) -> tuple[tuple[float, float, float], ...]:
+        """K, row by row: from a direction (x, y, 1) to pixels, without distortion."""
+        return (self.fx_px, 0.0, self.cx_px), (0.0, self.fy_px, self.cy_px), (0.0, 0.0, 1.0)
+
     def scaled(self, x_ratio: float, y_ratio: float) -> "Intrinsics":
         """The same camera after a resize by these ratios; distortion has no unit and stays."""
         return Intrinsics(
