@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from model_export.grids import GRID, GridCamera, draw_camera, draw_pose, photograph, picture, sweep
+from model_export.grids import GRID, SIZE_PX, GridCamera, draw_camera, draw_pose, photograph, picture, sweep
 from model_export.render import DISC
 from service.calibration.calibrate import Task, calibrate
 from service.calibration.fit import Interval
@@ -69,12 +69,11 @@ def random_camera(seed: int) -> Trial:
     return Trial(camera, calibrate(Task(GRID), sweep(rng, camera, GRID, count)))
 
 
-def paper_pairs(number: float, pairs: int, seed: int = 0) -> list[tuple[Method, Trial]]:
+def paper_pairs(number: float, pairs: int) -> list[tuple[Method, Trial]]:
     """The paper's protocol: focused and defocused pictures of the sheet at half the focus distance, which is given."""
-    rng = np.random.default_rng((seed, round(100 * number)))
+    rng = np.random.default_rng((0, round(100 * number)))
     camera = GridCamera(
-        1280,
-        960,
+        *SIZE_PX,
         PAPER_SIGMA * number,
         0.6,
         PAPER_FOCUS_M,

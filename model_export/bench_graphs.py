@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 from torch.nn.utils import convert_conv2d_weight_memory_format
 from torch.utils.flop_counter import FlopCounterMode
 
-from model_export.config import TrainConfig
+from model_export.config import Kind, TrainConfig
 from model_export.cores import torch_threads
 from model_export.export import export_pair
 from model_export.folded import folded
@@ -127,9 +127,7 @@ class NetworkRow:
     faster_than_runtime: float
 
 
-def time_networks(
-    model: Path, scratch: Path, rounds: int, on_round: Callable[[], None] = lambda: None
-) -> list[NetworkRow]:
+def time_networks(model: Path, scratch: Path, rounds: int, on_round: Callable[[], None]) -> list[NetworkRow]:
     """The paper's network in PyTorch and in ONNX Runtime, and the model's graphs, in int8 too, by threads."""
     picture, papers = draw_picture(*SIZE), scratch / "paper"
     export_pair(make_pair("paper"), TrainConfig(kind="paper"), 0, papers)  # untrained: only its speed is of interest
@@ -160,9 +158,9 @@ def time_networks(
     return rows
 
 
-def graph_flops(kind: str, width_px: int, height_px: int) -> int:
+def graph_flops(kind: Kind, width_px: int, height_px: int) -> int:
     """Floating-point operations of a pair's convolutions as exported, for one picture."""
-    pair = folded(make_pair("paper" if kind == "paper" else "compact"))
+    pair = folded(make_pair(kind))
     with FlopCounterMode(display=False) as counter:
         _eager(pair, np.zeros((height_px, width_px, 3), np.uint8), torch.contiguous_format)()
     return int(counter.get_total_flops())
@@ -267,7 +265,7 @@ class SizeRow:
     cost_of_a_pixel: float
 
 
-def time_sizes(model: Path, rounds: int, on_round: Callable[[], None] = lambda: None) -> list[SizeRow]:
+def time_sizes(model: Path, rounds: int, on_round: Callable[[], None]) -> list[SizeRow]:
     """From a photograph to a depth map at several sizes, read at full size."""
     estimator = Estimator(GraphPair(load_model_folder(model), THREADS[-1]))
 

@@ -34,14 +34,14 @@ class RequestRow:
     around_graphs_ms: float
 
 
-def time_frames(server: Server, rounds: int, on_round: Callable[[], None] = lambda: None) -> RequestRow:
+def time_frames(server: Server, rounds: int, on_round: Callable[[], None]) -> RequestRow:
     """A 640x480 frame, as a robot sends them."""
     row = _timed(server, "frame", SIZE, FRAME_K_CAM_PX, rounds)
     on_round()
     return row
 
 
-def time_photographs(server: Server, rounds: int, on_round: Callable[[], None] = lambda: None) -> list[RequestRow]:
+def time_photographs(server: Server, rounds: int, on_round: Callable[[], None]) -> list[RequestRow]:
     """A 12-megapixel photograph by cameras whose blur is read at full size, and at a fraction of it."""
     rows = []
     for k_cam_px in PHOTOGRAPHS_K_CAM_PX:

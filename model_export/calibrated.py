@@ -1,6 +1,5 @@
 """A camera as our own calibration finds it: simulated photographs of a sheet, and nothing told of the camera."""
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -18,7 +17,7 @@ SEED = 0
 
 @cache
 def calibrated(camera: Camera) -> Camera:
-    """The camera with the k_cam, gamma, focus distance and intrinsics that its photographs of a sheet tell.
+    """The camera that its photographs of a sheet tell: k_cam, gamma, focus distance and intrinsics.
 
     The sheet is moved through the plane in focus, no farther from it than a third of a circle's radius of blur.
     Raises ``ValueError`` for a camera without intrinsics, or whose sheet tells nothing.
@@ -36,11 +35,4 @@ def calibrated(camera: Camera) -> Camera:
     report = calibrate(Task(SHEET), sweep(np.random.default_rng(SEED), known, SHEET, PHOTOGRAPHS))
     if report.result is None:
         raise ValueError(f"no calibration: {report.problem}")
-    found = report.result
-    return replace(
-        camera,
-        k_cam_px=found.k_cam_px.value,
-        gamma_px=found.gamma_px.value,
-        focus_distance_m=found.focus_distance_m.value,
-        intrinsics=found.intrinsics,
-    )
+    return report.result.to_camera()

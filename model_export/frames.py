@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from model_export.datasets.photos import filled, load_photos
+from model_export.datasets.photos import CAMERAS, filled, load_photos
 from service.optics import thin_lens
 from service.optics.light import decode_srgb
 
@@ -39,10 +39,11 @@ class Frame:
 
 def load_frames(folder: Path) -> list[Frame]:
     """All frames of a folder with ``color/``, ``depth/`` and ``cameras.json``. Raises if there is none."""
-    cameras = json.loads((folder / "cameras.json").read_text())
+    file = folder / CAMERAS
+    cameras = json.loads(file.read_text())
     photos = list(load_photos(folder))
     if unknown := [photo.name for photo in photos if photo.name not in cameras]:
-        raise ValueError(f"{folder / 'cameras.json'} has no {unknown[0]}, which {folder / 'color'} has")
+        raise ValueError(f"{file} has no {unknown[0]}, which {folder / 'color'} has")
     return [
         Frame(photo.image, filled(photo.depth_m).astype(np.float16), cameras[photo.name]["fx_px"]) for photo in photos
     ]

@@ -18,6 +18,8 @@ from service.optics.camera import Intrinsics
 from service.optics.light import encode_srgb
 
 GRID = CircleGrid("asymmetric_circles", 11, 4, 20.0, 14.0)
+SIZE_PX = (1280, 960)  # of cameras that are drawn
+MOST_TILT_DEG = 25.0  # as a photographer is told
 NEAREST, FARTHEST = 0.6, 1.8  # of the focus distance
 MOST_BLUR = 1 / 3  # of a circle's radius
 INK, PAPER, TABLE = 0.04, 0.75, 0.25
@@ -53,11 +55,12 @@ class GridPose:
 
     turn: Array
     shift_m: Array
-    gradient: tuple[float, float] = (0.0, 0.0)
+    gradient: tuple[float, float]
 
 
-def draw_camera(rng: np.random.Generator, width_px: int = 1280, height_px: int = 960) -> GridCamera:
+def draw_camera(rng: np.random.Generator) -> GridCamera:
     """A random camera whose blur can be measured on a sheet of paper."""
+    width_px, height_px = SIZE_PX
     view = rng.uniform(0.9, 1.6)
     fx = width_px * view
     distortion = (rng.uniform(-0.15, 0.1), rng.uniform(-0.05, 0.05), *rng.uniform(-1e-3, 1e-3, 2).tolist(), 0.0)
@@ -75,15 +78,16 @@ def draw_camera(rng: np.random.Generator, width_px: int = 1280, height_px: int =
     )
 
 
-def draw_pose(
-    rng: np.random.Generator, camera: GridCamera, grid: CircleGrid, depth_m: float, *, tilt_deg: float = 25.0
-) -> GridPose:
-    """The sheet with its middle about ``depth_m`` away, tilted by up to ``tilt_deg``, turned, and wholly in view."""
+def draw_pose(rng: np.random.Generator, camera: GridCamera, grid: CircleGrid, depth_m: float) -> GridPose:
+    """The sheet with its middle about ``depth_m`` away, tilted by up to 25 degrees, turned, and wholly in view.
+
+    Raises ``ValueError`` where it does not fit into the picture.
+    """
     middle = np.append(grid.points_mm().mean(0), 0.0) / 1e3
     is_tall = grid.size_mm[1] > grid.size_mm[0]
     lengthwise = math.pi / 2 if is_tall == (camera.width_px > camera.height_px) else 0.0
     for attempt in range(200):
-        tilt, axis = math.radians(rng.uniform(0.2, 1) * tilt_deg), rng.uniform(0, 2 * math.pi)
+        tilt, axis = math.radians(rng.uniform(0.2, 1) * MOST_TILT_DEG), rng.uniform(0, 2 * math.pi)
         roll = lengthwise + rng.uniform(-0.4, 0.4)
         lean = cv2.Rodrigues(np.array([math.cos(axis), math.sin(axis), 0]) * tilt)[0]
         turn = np.asarray(lean @ cv2.Rodrigues(np.array([0, 0, roll]))[0], np.float64)

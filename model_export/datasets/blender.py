@@ -35,6 +35,7 @@ COMPLETE = "camind-complete"  # in an environment that an installation has not l
 PYTHON = "python3.11"
 WORKER = Path(__file__).with_name("blender_worker.py")
 EDGE_ANGLE = math.radians(5)
+EDGE_SIZE_PX, EDGE_SAMPLES, ROOM_SAMPLES = 128, 1024, 64
 EDGE_SIGMAS_PX = (0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0)
 EDGE_EXCESS = 0.5
 EDGE_OVERSAMPLE = 8
@@ -65,7 +66,7 @@ class Scene:
         return self.focal_length_mm / self.sensor_width_mm * self.size_px
 
 
-def edges(size_px: int = 128, samples: int = 1024) -> list[Scene]:
+def edges() -> list[Scene]:
     """Slanted edges of every sigma in ``EDGE_SIGMAS_PX`` before and behind the plane in focus."""
     found = []
     for sigma_px in EDGE_SIGMAS_PX:
@@ -75,18 +76,18 @@ def edges(size_px: int = 128, samples: int = 1024) -> list[Scene]:
         ):
             k_cam_px = sigma_px / EDGE_EXCESS
             name = f"edge_{side}_{sigma_px:g}"
-            found.append(Scene(name, "edge", 1, size_px, 2.0, k_cam_px, 50.0, 36.0, samples, depth_m))
+            found.append(Scene(name, "edge", 1, EDGE_SIZE_PX, 2.0, k_cam_px, 50.0, 36.0, EDGE_SAMPLES, depth_m))
     return found
 
 
-def rooms(count: int, size_px: int = 256, samples: int = 64) -> list[Scene]:
+def rooms(count: int, size_px: int = 256) -> list[Scene]:
     """Rooms by cameras with k_cam 0.8 to 15 px, focused at 0.4 to 4 m."""
     found = []
     for seed in range(count):
         dice = random.Random(seed)
         focus_m, k_cam_px = (math.exp(dice.uniform(math.log(a), math.log(b))) for a, b in ((0.4, 4), (0.8, 15)))
         focal_mm = dice.uniform(25, 70)
-        found.append(Scene(f"room_{seed:03d}", "room", seed, size_px, focus_m, k_cam_px, focal_mm, 36.0, samples))
+        found.append(Scene(f"room_{seed:03d}", "room", seed, size_px, focus_m, k_cam_px, focal_mm, 36.0, ROOM_SAMPLES))
     return found
 
 

@@ -78,10 +78,10 @@ def material(name):
     return made, made.node_tree.nodes, made.node_tree.links
 
 
-def emitting(name, strength=1.0):
+def emitting(name):
     made, nodes, links = material(name)
     glow, out = nodes.new("ShaderNodeEmission"), nodes.new("ShaderNodeOutputMaterial")
-    glow.inputs["Strength"].default_value = strength
+    glow.inputs["Strength"].default_value = 1.0
     links.new(glow.outputs[0], out.inputs["Surface"])
     return made, nodes, links, glow
 

@@ -127,7 +127,7 @@ def fit_again(edge: EdgeFit, spread: Spread) -> EdgeFit:
     return _fitted(edge.patch, np.array(edge.values), spread)
 
 
-def find_spread(edges: Sequence[EdgeFit], gamma_px: float, tick: Callable[[], None] = lambda: None) -> Spread:
+def find_spread(edges: Sequence[EdgeFit], gamma_px: float, tick: Callable[[], None]) -> Spread:
     """The point spread that fits the most blurred of a camera's discs best; a Gaussian if none is clearly blurred.
 
     A lens's disc is about as soft as gamma, in focus or not. ``tick`` is called now and then.

@@ -8,7 +8,7 @@ they trade against each other, and the intervals and warnings say so.
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 
 import numpy as np
@@ -53,18 +53,14 @@ class FitError(Exception):
 class Circles:
     """Measured circles, each array [n]: depth along the axis, lambda with its standard error, and which picture.
 
-    ``is_focused`` marks those of pictures for which the lens was focused on the sheet; by default there are none.
+    ``is_focused`` marks those of pictures for which the lens was focused on the sheet.
     """
 
     depth_m: Array
     blur_px: Array
     blur_error_px: Array
     picture: NDArray[np.int64]
-    is_focused: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
-
-    def __post_init__(self) -> None:
-        if self.is_focused.size == 0:
-            object.__setattr__(self, "is_focused", np.zeros(self.depth_m.size, np.bool_))
+    is_focused: NDArray[np.bool_]
 
     def only(self, where: NDArray[np.int64] | NDArray[np.bool_]) -> "Circles":
         """Those at the given places."""

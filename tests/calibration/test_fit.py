@@ -21,7 +21,8 @@ def circles(depths_m: tuple[float, ...], *, error: float = 0.02, seed: int = 0, 
     blur = thin_lens.blur_at_depth(depth, FOCUS, K_CAM, GAMMA)
     shared = rng.standard_normal(len(depths_m))[picture]
     noise = error * (0.7 * rng.standard_normal(picture.size) + 0.7 * shared)
-    return Circles(depth, blur * (1 + noise), np.full(picture.size, 0.02), picture)
+    nowhere = np.zeros(picture.size, np.bool_)
+    return Circles(depth, blur * (1 + noise), np.full(picture.size, 0.02), picture, nowhere)
 
 
 def test_both_sides_of_focus_give_all_three() -> None:
@@ -52,8 +53,7 @@ def test_a_few_wrong_circles_are_shown_and_move_little() -> None:
     some = circles(BOTH_SIDES)
     blur = some.blur_px.copy()
     blur[::25] *= 2.5
-    wrong = Circles(some.depth_m, blur, some.blur_error_px, some.picture)
-    found = fit_constants(wrong, resamples=20)
+    found = fit_constants(replace(some, blur_px=blur), resamples=20)
     assert found.k_cam_px.value == pytest.approx(K_CAM, rel=0.05)
     assert found.is_outlier[::25].mean() > 0.8
     assert np.delete(found.is_outlier, np.s_[::25]).mean() < 0.05
@@ -128,6 +128,7 @@ def test_two_lenses_mixed_are_said() -> None:
                 (one.blur_px, blur),
                 (one.blur_error_px, other.blur_error_px),
                 (one.picture, other.picture + 4),
+                (one.is_focused, other.is_focused),
             )
         )
     )
