@@ -20,10 +20,10 @@ from threadpoolctl import threadpool_limits
 from torch.nn.utils import convert_conv2d_weight_memory_format
 from torch.utils.flop_counter import FlopCounterMode
 
+from model_export.batch_norms import folded
 from model_export.config import Kind, TrainConfig
-from model_export.cores import torch_threads
+from model_export.devices import torch_threads
 from model_export.export import export_pair
-from model_export.folded import folded
 from model_export.losses import correct
 from model_export.networks import Pair, Scene, make_pair
 from model_export.textures import draw_texture

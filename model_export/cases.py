@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from model_export.config import SceneConfig
 from model_export.datasets.photos import CAMERAS, Photo, filled, load_photos
+from model_export.pool import HELD_OUT_SEED
 from model_export.render import refocus
 from model_export.scenes import draw_sample, draw_shot, true_blur_px
-from model_export.train import HELD_OUT_SEED
 from service.inference.known import KnownDepth
 from service.inference.pair import Side
 from service.optics import thin_lens

@@ -181,7 +181,7 @@ def average(
 ) -> None:
     """Mean of the weights of two checkpoints, one trained on from the other."""
     with _training_parts():
-        from model_export.train import Checkpoint
+        from model_export.checkpoint import Checkpoint
 
     with _plain_failures():
         Checkpoint.load(first).averaged(Checkpoint.load(second), share, part or "").save(out)
@@ -347,7 +347,7 @@ def calibration(
 
     with _training_parts():
         from model_export import bench_calibration as trials
-        from model_export.cores import one_core
+        from model_export.devices import one_core
 
     stdout = Console()
     with (

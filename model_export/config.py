@@ -164,3 +164,6 @@ class TrainConfig:
         """What is set otherwise than in another, as ``name value for value``."""
         ours, theirs = ({**own, **own.pop("scenes")} for own in (self.as_dict(), other.as_dict()))
         return [f"{name} {value} for {theirs[name]}" for name, value in ours.items() if value != theirs[name]]
+
+
+UNCHANGED = TrainConfig()

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from model_export.config import TrainConfig
-from model_export.cores import columns, sent
+from model_export.devices import columns, sent
 from model_export.render import GAUSSIAN, Numbers, Spreads, blur_varying, transfers
 from model_export.scenes import (
     GRAIN,

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from model_export.calibrated import calibrated
 from model_export.cases import KNOWN_DEPTHS, UNSEEN_K_CAM_PX, Case, Trial
-from model_export.cores import one_core
+from model_export.devices import one_core
 from model_export.metrics import Scores, best_constant, completed, mean_scores, pooled_scores, score
 from service.cores import available_cores
 from service.inference.artifact import ModelFolder, load_model_folder

@@ -12,9 +12,10 @@ import onnx
 import torch
 from torch import Tensor, nn
 
+from model_export.batch_norms import folded
 from model_export.card import card_text, sources_of
+from model_export.checkpoint import Checkpoint
 from model_export.config import SceneConfig, TrainConfig
-from model_export.folded import folded
 from model_export.networks import (
     BLUR_BOUNDS_PX,
     MULTIPLE,
@@ -25,7 +26,6 @@ from model_export.networks import (
     Scene,
     parameter_count,
 )
-from model_export.train import Checkpoint
 from service.inference.artifact import (
     BLUR_INPUTS,
     BLUR_OUTPUTS,

@@ -17,15 +17,16 @@ from rich.console import Console
 from torch import Tensor, nn
 from torch.nn import functional
 
+from model_export.batch_norms import batch_norm, norm_gain, restored, spread_norms
+from model_export.checkpoint import Checkpoint
 from model_export.config import TrainConfig
-from model_export.cores import torch_threads
+from model_export.devices import torch_threads
 from model_export.losses import Batch, run_pair
-from model_export.networks import Normed, Pair, Widths, batch_norm, make_pair, norm_gain
+from model_export.networks import Normed, Pair, Widths, make_pair
+from model_export.pool import Pool, held_out
 from model_export.progress import progress_bar
-from model_export.restored import restored, spread_norms
 from model_export.scenes import Material
 from model_export.textures import load_photographs
-from model_export.train import Checkpoint, Pool, held_out
 
 PIXELS = 10_000  # of a batch, of each map
 RIDGE = 1e-7

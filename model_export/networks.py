@@ -212,19 +212,6 @@ class Normed(nn.Module):
         return normed
 
 
-def batch_norm(normed: Normed) -> nn.BatchNorm2d:
-    """A layer's own; raises ``TypeError`` where it is folded away."""
-    if not isinstance(normed.norm, nn.BatchNorm2d):
-        raise TypeError("these batch norms are folded already")
-    return normed.norm
-
-
-def norm_gain(norm: nn.BatchNorm2d) -> Tensor:
-    """What a batch norm multiplies each channel with in evaluation mode [c]."""
-    gain: Tensor = norm.weight / (norm.get_buffer("running_var") + norm.eps).sqrt()
-    return gain
-
-
 class Block(nn.Module):
     """Normed convolutions, a ReLU after each; the first may see several maps."""
 

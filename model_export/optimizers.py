@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from model_export.cores import computes_bfloat16
+from model_export.devices import computes_bfloat16
 
 MOMENTUM = 0.95
 NEWTON_SCHULZ = (3.4445, -4.775, 2.0315)  # Jordan et al.: the steepest at zero that does not run away

@@ -17,8 +17,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model_export.cores import columns, sent
 from model_export.datasets.photos import filled
+from model_export.devices import columns, sent
 from service.optics import thin_lens
 from service.optics.camera import Camera
 from service.optics.light import decode_srgb, encode_srgb

@@ -1,339 +1,37 @@
-"""The training loop: scenes flow through a pool, batches are drawn from it, checkpoints resume exactly.
+"""The training loop: batches of a pool move the weights, and checkpoints resume exactly."""
 
-Which scenes are in the pool at a step follows from the step alone, never from timing, so a run with one seed
-is one run, however fast the scene workers are and however often it is stopped.
-"""
-
-import math
-import os
-import pickle
 import signal
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from queue import Queue
-from threading import Event, Thread, current_thread, main_thread
+from threading import Event, current_thread, main_thread
 from typing import Any
 
-import numpy as np
 import torch
 from rich.console import Console
 from rich.progress import Progress
 from torch import Tensor, nn
 from torch.nn.utils import convert_conv2d_weight_memory_format
-from torch.utils.data import DataLoader, Dataset
 
-from model_export.config import MOST_SEED, Kind, Learning, SceneConfig, TrainConfig
-from model_export.cores import computes_bfloat16, one_core, sent, torch_threads
-from model_export.darkroom import photograph
-from model_export.folded import folded
+from model_export.batch_norms import folded, spread_norms
+from model_export.checkpoint import Checkpoint, starting_pair
+from model_export.config import UNCHANGED, Learning, TrainConfig
+from model_export.devices import computes_bfloat16, new_stream, torch_threads
 from model_export.frames import load_frames
-from model_export.losses import UPRIGHT, UPSIDE_DOWN, Batch, Mirror, run_pair, total_loss
+from model_export.losses import Batch, run_pair, total_loss
 from model_export.networks import SHIPPED_WIDTHS, CompactDepth, Pair, Widths, make_pair, with_fresh_decoders
 from model_export.optimizers import Optimizers
+from model_export.pool import Pools, held_out
 from model_export.progress import progress_bar
-from model_export.restored import restored, spread_norms
-from model_export.scenes import Material, Negative, Sample, Shot, draw_negative, draw_sample
+from model_export.scenes import Material
 from model_export.textures import load_photographs
 from service.cores import available_cores
-from service.inference.artifact import load_model_folder
 
-FOCAL_UNKNOWN_SHARE = 0.3
-LEAST_CONTRAST = 0.15  # of a faded picture, as a part of what it had
-LEAST_LIGHT = 0.2  # of a dimmed one
-# a camera known by its specs has a guess for gamma: mostly too low a one, since motion, haze and filters add softness
-GUESSED_GAMMA_SHARE, GUESSED_GAMMA = 0.6, (-0.2, 0.35)  # mean and standard deviation of the guess's log error
-HELD_OUT_SEED = (MOST_SEED + 1) * 2**32
 CHECKPOINT = "checkpoint.pt"
-UNCHANGED = TrainConfig()
-AHEAD = 64
 MOST_HELD_OUT = 32
-
-Drawn = Sample | Negative
-new_stream: Callable[[torch.device], torch.cuda.Stream] = torch.cuda.Stream  # whose own signature has no types
-
-
-class SceneStream(Dataset[Drawn]):
-    """Scene number ``start + i`` of a run, drawn in a worker process: its picture, or the scene itself."""
-
-    def __init__(self, config: TrainConfig, material: Material, start: int, end: int) -> None:
-        self.config, self.material = config, material
-        self.start, self.end = start, end
-
-    def __len__(self) -> int:
-        return self.end - self.start
-
-    def __getitem__(self, index: int) -> Drawn:
-        seed = self.config.seed * 2**32 + self.start + index
-        draw = draw_negative if self.config.retaken else draw_sample
-        return draw(seed, self.config.scenes, self.material)
-
-
-def _worker_start(_: int) -> None:
-    one_core()
-    os.nice(19)  # steps come first where cores are shared
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever stops a run stops its steps, which then save what they did
-
-
-def scene_stream(config: TrainConfig, material: Material, start: int, end: int, workers: int) -> Iterator[Drawn]:
-    """Scenes ``start`` to ``end`` in order, drawn ahead by worker processes (0: in this one)."""
-    stream = SceneStream(config, material, start, end)
-    loader: DataLoader[Drawn] = DataLoader(
-        stream,
-        batch_size=None,
-        num_workers=workers,
-        worker_init_fn=_worker_start,
-        prefetch_factor=max(8, 64 // workers) if workers else None,
-        multiprocessing_context="forkserver" if workers else None,
-    )
-    return iter(loader)
-
-
-def arriving(stream: Iterator[Drawn], device: torch.device) -> Iterator[Drawn]:
-    """The stream, its scenes on a CUDA device: brought there by a thread of its own, some ahead, beside all else."""
-    waiting: Queue[Drawn | Exception | None] = Queue(AHEAD)
-
-    def bring() -> None:
-        beside = new_stream(device)
-        try:
-            with torch.cuda.stream(beside):
-                for drawn in stream:
-                    moved = replace(drawn, surfaces=drawn.surfaces.to(device)) if isinstance(drawn, Negative) else drawn
-                    beside.synchronize()
-                    waiting.put(moved)
-            waiting.put(None)
-        except Exception as exc:
-            waiting.put(exc)
-
-    Thread(target=bring, daemon=True).start()
-    while (drawn := waiting.get()) is not None:
-        if isinstance(drawn, Exception):
-            raise drawn
-        if isinstance(drawn, Negative):
-            drawn.surfaces.record_stream(torch.cuda.current_stream(device))
-        yield drawn
-
-
-class Pool:
-    """The last ``pool`` scenes of the stream; ``fresh_per_step`` new ones come in after every batch, on average."""
-
-    def __init__(self, config: TrainConfig, material: Material, step: int, workers: int, device: str = "cpu") -> None:
-        self.config, self.device = config, torch.device(device)
-        first = self._drawn(step) - config.pool
-        stream = scene_stream(config, material, first, self._drawn(config.steps) + 1, workers)
-        self.stream = arriving(stream, self.device) if self.device.type == "cuda" else stream
-        self.samples: deque[Drawn] = deque(maxlen=config.pool)
-
-    def _drawn(self, step: int) -> int:
-        """How many scenes have come in before ``step``: a full pool first, then the steady flow."""
-        return self.config.pool + int(step * self.config.fresh_per_step)
-
-    def fill(self) -> Iterator[int]:
-        """Bring the pool to its state at the first step, one scene at a time."""
-        for number in range(self.config.pool):
-            self.samples.append(next(self.stream))
-            yield number
-
-    def batch(self, step: int) -> Batch:
-        """The batch of a step: scenes, flips, hints and all follow from seed and step."""
-        rng = np.random.default_rng((self.config.seed, step))
-        chosen = [self.samples[i] for i in rng.integers(0, len(self.samples), self.config.batch)]
-        negatives = [drawn for drawn in chosen if isinstance(drawn, Negative)]
-        if negatives:
-            return collate_retaken(negatives, rng, self.config, self.device)
-        return collate([drawn for drawn in chosen if isinstance(drawn, Sample)], rng, self.config)
-
-    def settling(self) -> Iterator[Batch]:
-        """Batches of the pool as it is that no step draws, for batch norms to settle on."""
-        return (self.batch(self.config.steps + i) for i in range(self.config.settle_batches))
-
-    def refresh(self, step: int) -> None:
-        """Let in the new scenes that come after this step; as many old ones go."""
-        for _ in range(self._drawn(step), self._drawn(step + 1)):
-            self.samples.append(next(self.stream))
-
-
-class Pools:
-    """A pool, and one of larger pictures where some steps have those: which is a step's follows from its number."""
-
-    def __init__(self, config: TrainConfig, material: Material, step: int, workers: int, device: str = "cpu") -> None:
-        self.large_share = config.large_share
-        configs = [config, config.enlarged()] if config.large_share else [config]
-        own = -(-workers // len(configs))
-        self.pools = [Pool(each, material, step, own, device) for each in configs]
-        self.size = sum(each.pool for each in configs)
-
-    def fill(self) -> Iterator[int]:
-        """Bring the pools to their state at the first step, one scene at a time."""
-        return (number for pool in self.pools for number in pool.fill())
-
-    def batch(self, step: int) -> Batch:
-        """The batch of a step."""
-        is_large = int((step + 1) * self.large_share) > int(step * self.large_share)
-        return self.pools[is_large].batch(step)
-
-    def settling(self) -> Iterator[Batch]:
-        """Batches that no step draws, for batch norms to settle on: not of larger pictures."""
-        return self.pools[0].settling()
-
-    def refresh(self, step: int) -> None:
-        """Let in the new scenes that come after this step."""
-        for pool in self.pools:
-            pool.refresh(step)
-
-
-def collate(samples: list[Sample], rng: np.random.Generator, config: TrainConfig = UNCHANGED) -> Batch:
-    """Samples to tensors, flipped and turned at random, focal length shown or not, gamma told or guessed.
-
-    Most are left upright: below is nearer, as in most photographs. A side is asked for at times, of scenes on both
-    sides either: a near thing may stand before a far background.
-    """
-    images, excesses, rows = [], [], []
-    for sample in samples:
-        turns, flip = _turn(rng, config)
-        images.append(np.rot90(sample.image, turns, (1, 2))[:, :, ::flip].copy())
-        excesses.append(np.rot90(sample.excess, turns)[:, ::flip].astype(np.float32))
-        rows.append(_told(rng, sample.shot, config))
-    image = torch.from_numpy(np.stack(images)).float() / 255
-    return _batch(rng, config, image, torch.from_numpy(np.stack(excesses))[:, None], rows)
-
-
-def collate_retaken(
-    negatives: Sequence[Negative], rng: np.random.Generator, config: TrainConfig, device: torch.device
-) -> Batch:
-    """The same of pictures that are taken now, on the device."""
-    with torch.autocast(device.type, enabled=False):
-        image, excess, shots = photograph(rng, negatives, config, device)
-    turns, flips = zip(*(_turn(rng, config) for _ in negatives), strict=True)
-    both = torch.cat([image, excess], 1)
-    for turn in (1, 2, 3):
-        chosen = sent(np.flatnonzero(np.array(turns) == turn), device)
-        both[chosen] = torch.rot90(both[chosen], turn, (2, 3))
-    flipped = sent(np.array(flips) < 0, device)[:, None, None, None]
-    both = torch.where(flipped, both.flip(3), both)
-    return _batch(rng, config, both[:, :3], both[:, 3:], [_told(rng, shot, config) for shot in shots])
-
-
-def _turn(rng: np.random.Generator, config: TrainConfig) -> tuple[int, int]:
-    """How many quarters a picture is turned, and -1 if it is mirrored."""
-    return int(rng.integers(4)) if rng.random() < config.turned_share else 0, int(rng.choice([-1, 1]))
-
-
-def _told(rng: np.random.Generator, shot: Shot, config: TrainConfig) -> tuple[float, ...]:
-    """A shot as a batch has it: numbers of its camera, the gamma told, the side, what is left of contrast and light."""
-    focal = 0.0 if rng.random() < FOCAL_UNKNOWN_SHARE else shot.focal_length_px
-    side = (shot.side or int(rng.choice([-1, 1]))) if rng.random() < config.hint_share else 0
-    guess = math.exp(rng.normal(*GUESSED_GAMMA)) if rng.random() < GUESSED_GAMMA_SHARE else 1.0
-    worn = _left(rng, config.faded_share, LEAST_CONTRAST), _left(rng, config.dimmed_share, LEAST_LIGHT)
-    return (shot.k_cam_px, shot.gamma_px, guess * shot.gamma_px, shot.focus_distance_m, focal, side, *worn)
-
-
-def _left(rng: np.random.Generator, share: float, least: float) -> float:
-    """What is left of 1, in that share of the pictures: at least so much, all orders of magnitude alike."""
-    return float(least ** rng.random()) if rng.random() < share else 1.0
-
-
-def _batch(
-    rng: np.random.Generator, config: TrainConfig, image: Tensor, excess: Tensor, rows: Sequence[tuple[float, ...]]
-) -> Batch:
-    columns = sent(torch.tensor(rows, dtype=torch.float32), image.device).unbind(1)
-    place = (rng.random(), rng.random())
-    mirrors: tuple[Mirror, ...] = UPRIGHT + UPSIDE_DOWN
-    if not config.all_mirrors:  # on two cores all four cost teachers more than the step itself
-        mirrors = (UPRIGHT[rng.integers(2)], UPSIDE_DOWN[rng.integers(2)])
-    return Batch(image.contiguous(memory_format=torch.channels_last), excess, *columns, place=place, mirrors=mirrors)
-
-
-def held_out(scenes: SceneConfig, material: Material, numbers: Iterable[int]) -> Batch:
-    """Scenes of seeds no training draws, as one batch."""
-    samples = [draw_sample(HELD_OUT_SEED + i, scenes, material) for i in numbers]
-    return collate(samples, np.random.default_rng(HELD_OUT_SEED))
-
-
-@dataclass(frozen=True, slots=True)
-class Checkpoint:
-    """Everything a run needs to go on, or an export to make files from."""
-
-    config: TrainConfig
-    step: int
-    modules: dict[str, Any]
-    optimizers: list[dict[str, Any]]
-
-    def save(self, path: Path) -> None:
-        """Write whole or not at all."""
-        content = {
-            "config": self.config.as_dict(),
-            "step": self.step,
-            "modules": self.modules,
-            "optimizers": self.optimizers,
-        }
-        path.parent.mkdir(parents=True, exist_ok=True)
-        scratch = path.with_suffix(".part")
-        torch.save(content, scratch)
-        scratch.replace(path)
-
-    @classmethod
-    def load(cls, path: Path) -> "Checkpoint":
-        """Of a file, or of a float32 model folder; ``ValueError`` for one of another version, or that is none."""
-        try:
-            content = _as_checkpoint(path) if path.is_dir() else torch.load(path, map_location="cpu", weights_only=True)
-            told, step, modules = (content[name] for name in ("config", "step", "modules"))
-        except (RuntimeError, EOFError, pickle.UnpicklingError, LookupError, TypeError) as exc:
-            raise ValueError(f"{path} is no checkpoint of camind, or is cut off or damaged") from exc
-        try:
-            config = TrainConfig.from_dict(told)
-        except TypeError as exc:
-            raise ValueError(f"{path} was written by another version of camind: {exc}") from exc
-        return cls(config, step, modules, content.get("optimizers", []))
-
-    def averaged(self, other: "Checkpoint", share: float = 0.5, part: str = "") -> "Checkpoint":
-        """This one with its weights moved by ``share`` towards another run's, one of them trained on from the other.
-
-        Only those of a ``part`` where one is named: ``blur``, ``depth`` or ``depth.layout``.
-
-        Of two such runs the mean is often better than either (Izmailov et al. 2018). A share below 0 goes on past this
-        one, away from the other, as a longer run might have; a batch norm's variance no further than to 0. Raises
-        ``ValueError`` for networks of another kind or width.
-        """
-        if other.config.kind != self.config.kind:
-            raise ValueError(f"weights of a {self.config.kind} and a {other.config.kind} pair have no mean")
-        if Widths.of(other.modules) != Widths.of(self.modules):
-            raise ValueError("weights of pairs with other channels have no mean")
-        modules = self.modules | {
-            name: torch.lerp(own, other.modules[name], share)
-            for name, own in self.modules.items()
-            if own.is_floating_point() and name.startswith(part)
-        }
-        modules |= {name: v.clamp_min(0) for name, v in modules.items() if name.endswith("running_var")}
-        return replace(self, modules=modules, step=self.step + other.step)
-
-    def pair(self) -> Pair:
-        """The networks with this checkpoint's weights, in evaluation mode."""
-        pair = make_pair(self.config.kind, Widths.of(self.modules))
-        pair.modules().load_state_dict(self.modules)
-        pair.modules().eval()
-        return pair
-
-
-def _as_checkpoint(folder: Path) -> dict[str, Any]:
-    """What a checkpoint would hold of a model folder, whose batch norms are folded away and wait for statistics."""
-    training = load_model_folder(folder).manifest.training
-    return {"config": training.config, "step": training.steps, "modules": restored(folder).modules().state_dict()}
-
-
-def starting_pair(weights: Path, kind: Kind) -> Pair:
-    """The networks of a checkpoint, or of a model folder, which may be of another version: its config is not asked for.
-
-    Raises ``ValueError`` for networks of another kind.
-    """
-    pair = restored(weights) if weights.is_dir() else Checkpoint.load(weights).pair()
-    if pair.kind != kind:
-        raise ValueError(f"weights of a {pair.kind} pair do not fit a {kind} pair")
-    return pair
 
 
 def _learning(pair: Pair, part: Learning) -> nn.ModuleList:

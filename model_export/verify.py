@@ -9,9 +9,9 @@ import onnxruntime
 import torch
 from numpy.typing import NDArray
 
+from model_export.checkpoint import Checkpoint
 from model_export.losses import correct
 from model_export.networks import LaidOutEstimate, Pair, Scene
-from model_export.train import Checkpoint
 from service.inference.artifact import BLUR_OUTPUTS, LAYOUT_MAP, LAYOUT_ODDS, load_model_folder
 
 SIZES = ((64, 64), (240, 320), (480, 640))

@@ -17,10 +17,10 @@ from model_export.darkroom import (
     render,
     retake,
 )
+from model_export.pool import collate_retaken
 from model_export.render import Layer, render_layers
 from model_export.scenes import _through_mosaic as through_mosaic
 from model_export.scenes import draw_negative, draw_sample
-from model_export.train import collate_retaken
 
 CPU = torch.device("cpu")
 SCENES = SceneConfig(size_px=64, margin_px=24)

@@ -9,12 +9,13 @@ import pytest
 import torch
 from rich.console import Console
 
+from model_export.checkpoint import Checkpoint, starting_pair
 from model_export.config import SceneConfig, TrainConfig
 from model_export.losses import Batch, run_pair
 from model_export.narrowed import narrow, narrowed
 from model_export.networks import Pair, Widths, make_pair
+from model_export.pool import held_out
 from model_export.scenes import Material
-from model_export.train import Checkpoint, held_out, starting_pair
 
 SHIPPED = Path(__file__).parents[2] / "service" / "models"
 WIDE = Widths((16, 32, 16, 32), (16, 32, 16, 32))

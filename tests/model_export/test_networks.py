@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch.nn import functional
 
+from model_export.batch_norms import folded
 from model_export.config import Kind, TrainConfig
-from model_export.folded import folded
 from model_export.losses import STANDING_OUT, Batch, correct, run_pair, standing_out, total_loss
 from model_export.networks import LUMINANCE, BandEnergy, Layout, Scene, Surroundings, make_pair, parameter_count
 from model_export.render import blur

@@ -9,14 +9,14 @@ import torch
 from onnxruntime import InferenceSession
 from typer.testing import CliRunner
 
+from model_export.batch_norms import restored, spread_norms
 from model_export.cli import commands
 from model_export.config import SceneConfig
 from model_export.export import export_checkpoint
 from model_export.losses import Batch, run_pair
 from model_export.networks import Pair
-from model_export.restored import restored, spread_norms
+from model_export.pool import held_out
 from model_export.scenes import Material
-from model_export.train import held_out
 from service.inference.artifact import Graphs, load_model_folder, write_manifest
 
 SHIPPED = Path(__file__).parents[2] / "service" / "models"

@@ -17,27 +17,16 @@ import pytest
 import torch
 from rich.console import Console
 
+from model_export.batch_norms import folded, restored, spread_norms
+from model_export.checkpoint import Checkpoint, starting_pair
 from model_export.config import LARGE_SEED, MOST_SEED, Learning, SceneConfig, TrainConfig
-from model_export.cores import torch_threads
-from model_export.folded import folded
+from model_export.devices import torch_threads
 from model_export.losses import UPRIGHT, UPSIDE_DOWN, Batch, likeness_loss, reduced, run_pair, told_by, total_loss
 from model_export.networks import Widths, make_pair, with_fresh_decoders
-from model_export.restored import restored, spread_norms
+from model_export.pool import HELD_OUT_SEED, Pools, collate
 from model_export.scenes import Material, draw_sample
 from model_export.textures import load_photographs
-from model_export.train import (
-    HELD_OUT_SEED,
-    Checkpoint,
-    Pools,
-    Trainer,
-    collate,
-    config_of,
-    emphasis,
-    learning_rate,
-    settling_step,
-    starting_pair,
-    train,
-)
+from model_export.train import Trainer, config_of, emphasis, learning_rate, settling_step, train
 from service.cores import available_cores
 
 SHIPPED = Path(__file__).parents[2] / "service" / "models"
@@ -135,7 +124,7 @@ def test_a_run_at_its_end_says_so_and_draws_nothing(
     textures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run(CONFIG, textures, tmp_path / "run")
-    monkeypatch.delattr("model_export.train.draw_sample")
+    monkeypatch.delattr("model_export.pool.draw_sample")
     checkpoint, said = run(CONFIG, textures, tmp_path / "run")
     assert checkpoint.step == 6
     assert said.replace("\n", "").startswith(f"{tmp_path / 'run'} is at its end: go on with more --steps, or begin")

@@ -1,6 +1,6 @@
-"""What torch and OpenCV work on: how many cores, and in which numbers."""
+"""What torch and OpenCV work on: how many cores, in which numbers, and how numbers get to a device."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+
+new_stream: Callable[[torch.device], torch.cuda.Stream] = torch.cuda.Stream  # whose own signature has no types
 
 
 @contextmanager

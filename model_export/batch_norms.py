@@ -1,7 +1,9 @@
-"""A model folder back to networks that training goes on from: the way back of ``folded.py``."""
+"""Batch norms folded into the convolutions before them, as networks ship, and back, as training goes on from them."""
 
+import copy
 import math
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import onnx
@@ -9,12 +11,44 @@ import torch
 from onnx import numpy_helper
 from torch import Tensor, nn
 
-from model_export.folded import folded
-from model_export.networks import Normed, Pair, Widths, batch_norm, make_pair, norm_gain
+from model_export.networks import Normed, Pair, Widths, make_pair
 from service.inference.artifact import ModelFolder, load_model_folder
 
 PREFIX = "network."
 LEAST_LENGTH = 1e-6
+
+
+def batch_norm(normed: Normed) -> nn.BatchNorm2d:
+    """A layer's own; raises ``TypeError`` where it is folded away."""
+    if not isinstance(normed.norm, nn.BatchNorm2d):
+        raise TypeError("these batch norms are folded already")
+    return normed.norm
+
+
+def norm_gain(norm: nn.BatchNorm2d) -> Tensor:
+    """What a batch norm multiplies each channel with in evaluation mode [c]."""
+    gain: Tensor = norm.weight / (norm.get_buffer("running_var") + norm.eps).sqrt()
+    return gain
+
+
+def folded(pair: Pair) -> Pair:
+    """A copy of a pair, in evaluation mode, that answers the same to rounding."""
+    blur, depth = copy.deepcopy(pair.blur).eval(), copy.deepcopy(pair.depth).eval()
+    for network in (blur, depth):
+        for module in network.modules():
+            if isinstance(module, Normed):
+                _fold(module)
+    return replace(pair, blur=blur, depth=depth)
+
+
+def _fold(normed: Normed) -> None:
+    norm = batch_norm(normed)
+    with torch.no_grad():
+        gain = norm_gain(norm)
+        for convolution in normed.convolutions():
+            convolution.weight.mul_(gain[:, None, None, None])
+        normed.convolutions()[-1].bias = nn.Parameter(norm.bias - gain * norm.get_buffer("running_mean"))
+    normed.norm = nn.Identity()
 
 
 def restored(model: Path) -> Pair:
