@@ -25,7 +25,7 @@ from model_export.config import Kind, TrainConfig
 from model_export.devices import torch_threads
 from model_export.export import export_pair
 from model_export.losses import correct
-from model_export.networks import Pair, Scene, make_pair
+from model_export.networks import Conditioning, Pair, make_pair
 from model_export.textures import draw_texture
 from service.config import INT8
 from service.inference.artifact import load_model_folder
@@ -97,13 +97,13 @@ def _eager(pair: Pair, picture: Picture, layout: torch.memory_format) -> Work:
     convert_conv2d_weight_memory_format(pair.modules().eval(), layout)
     image = (torch.from_numpy(picture).permute(2, 0, 1)[None].float() / 255).contiguous(memory_format=layout)
     gamma, k_cam = torch.tensor([0.5]), torch.tensor([FRAME_K_CAM_PX])
-    scene = Scene(torch.tensor([2.0]), torch.zeros(1), torch.zeros(1))
+    conditioning = Conditioning(torch.tensor([2.0]), torch.zeros(1), torch.zeros(1))
 
     def run() -> object:
         with torch.inference_mode():
             seen = pair.blur(image)
             x, spread = correct(seen, gamma, k_cam, 0.0)
-            return pair.depth(x, spread, scene, seen.features)
+            return pair.depth(x, spread, conditioning, seen.features)
 
     return run
 

@@ -20,10 +20,10 @@ from model_export.networks import (
     BLUR_BOUNDS_PX,
     MULTIPLE,
     CompactDepth,
+    Conditioning,
     Features,
     LaidOutEstimate,
     Pair,
-    Scene,
     parameter_count,
 )
 from service.inference.artifact import (
@@ -78,7 +78,7 @@ class _DepthGraph(nn.Module):
     def forward(
         self, defocus: Tensor, spread: Tensor, focus: Tensor, focal: Tensor, side: Tensor, features: Features
     ) -> tuple[Tensor, ...]:
-        out = self.network(defocus, spread, Scene(focus, focal, side), features)
+        out = self.network(defocus, spread, Conditioning(focus, focal, side), features)
         layout = (out.layout_map, out.layout_odds) if isinstance(out, LaidOutEstimate) else ()
         return out.log_ratio_near, out.log_ratio_far, torch.sigmoid(out.near_logit), out.log_scale, *layout
 

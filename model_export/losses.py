@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from model_export.config import TrainConfig
-from model_export.networks import BlurEstimate, DepthEstimate, Pair, Scene
+from model_export.networks import BlurEstimate, Conditioning, DepthEstimate, Pair
 from service.inference.artifact import BLUR_ERROR_RANGE
 from service.optics import thin_lens
 
@@ -57,8 +57,8 @@ class Batch:
         """With every tensor changed."""
         return Batch(*map(change, self.tensors()), place=self.place, mirrors=self.mirrors)
 
-    def scene(self) -> Scene:
-        return Scene(self.focus_distance_m, self.focal_length_px, self.side)
+    def conditioning(self) -> Conditioning:
+        return Conditioning(self.focus_distance_m, self.focal_length_px, self.side)
 
     def worn(self) -> "Batch":
         """With less contrast and light, in steps of a grey level again: what learns sees the picture so."""
@@ -91,7 +91,7 @@ def run_pair(pair: Pair, batch: Batch) -> tuple[BlurEstimate, DepthEstimate]:
     """Both networks with the camera correction between, in training's differentiable form."""
     blur: BlurEstimate = pair.blur(batch.image)
     x, spread = correct(blur, batch.told_gamma_px, batch.k_cam_px, DEFOCUS_FLOOR_PX)
-    depth: DepthEstimate = pair.depth(x, spread.detach(), batch.scene(), blur.features)
+    depth: DepthEstimate = pair.depth(x, spread.detach(), batch.conditioning(), blur.features)
     return blur, depth
 
 

@@ -62,7 +62,7 @@ class LaidOutEstimate(DepthEstimate):
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class Conditioning:
     """What the depth network knows besides the picture, each [n]: metres, pixels (0 = unknown), -1/0/+1."""
 
     focus_distance_m: Tensor
@@ -411,13 +411,15 @@ class CompactDepth(nn.Module):
             self.head.weight.mul_(0.1)
             self.head.get_parameter("bias").copy_(torch.tensor([-0.5, -0.5, 1.5, 0.0, -1.5]))
 
-    def forward(self, defocus: Tensor, spread: Tensor, scene: Scene, features: Features) -> LaidOutEstimate:
+    def forward(
+        self, defocus: Tensor, spread: Tensor, conditioning: Conditioning, features: Features
+    ) -> LaidOutEstimate:
         with torch.autocast(defocus.device.type, enabled=False):
             near = -torch.log1p(defocus)
             far = -torch.log1p(-defocus.clamp(max=0.97))
-            known = (scene.focal_length_px > 0).float()
-            focal = torch.log(scene.focal_length_px.clamp_min(50.0) / 600.0) * known
-            planes = [torch.log(scene.focus_distance_m), focal, known, scene.side]
+            known = (conditioning.focal_length_px > 0).float()
+            focal = torch.log(conditioning.focal_length_px.clamp_min(50.0) / 600.0) * known
+            planes = [torch.log(conditioning.focus_distance_m), focal, known, conditioning.side]
             log_spread = torch.log(spread.clamp(1e-3, 10.0))
             inputs = [near, far, defocus.clamp(max=3.0), log_spread * 0.3]
             inputs += [_plane(p, defocus) for p in planes]
@@ -467,8 +469,10 @@ class PaperDepth(nn.Module):
         self.unet = _papers_unet(2, self.WIDTHS, self.WIDTHS[:-1])
         self.head = nn.Conv2d(self.WIDTHS[0], 1, 1)
 
-    def forward(self, defocus: Tensor, _spread: Tensor, scene: Scene, features: Features) -> DepthEstimate:
-        inputs = torch.cat([defocus.clamp(max=8.0), _plane(scene.focus_distance_m, defocus)], 1)
+    def forward(
+        self, defocus: Tensor, _spread: Tensor, conditioning: Conditioning, features: Features
+    ) -> DepthEstimate:
+        inputs = torch.cat([defocus.clamp(max=8.0), _plane(conditioning.focus_distance_m, defocus)], 1)
         x = self.unet(inputs, joined=features)[-1]
         with torch.autocast(defocus.device.type, enabled=False):
             log_ratio = functional.conv2d(x.float(), self.head.weight, self.head.bias)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from model_export.checkpoint import Checkpoint
 from model_export.losses import correct
-from model_export.networks import LaidOutEstimate, Pair, Scene
+from model_export.networks import Conditioning, LaidOutEstimate, Pair
 from service.inference.artifact import BLUR_OUTPUTS, LAYOUT_MAP, LAYOUT_ODDS, load_model_folder
 
 SIZES = ((64, 64), (240, 320), (480, 640))
@@ -84,12 +84,12 @@ def through_torch(
     ``camera`` has the names of ``CAMERA``.
     """
     one = {name: torch.tensor([value]) for name, value in camera.items()}
-    scene = Scene(one["focus_distance_m"], one["focal_length_px"], torch.zeros(1))
+    conditioning = Conditioning(one["focus_distance_m"], one["focal_length_px"], torch.zeros(1))
     pair.modules().eval()
     with torch.inference_mode():
         seen = pair.blur(torch.from_numpy(image))
         x, spread = correct(seen, one["gamma_px"], one["k_cam_px"], 0.0)
-        told = pair.depth(x, spread, scene, seen.features)
+        told = pair.depth(x, spread, conditioning, seen.features)
     features = dict(zip(feature_names, (f.numpy() for f in seen.features), strict=True))
     expected = {
         "blur_px": seen.blur_px.numpy(),
@@ -104,9 +104,9 @@ def through_torch(
     feeds = {
         "relative_defocus": x.numpy(),
         "relative_defocus_spread": spread.numpy(),
-        "focus_distance_m": scene.focus_distance_m.numpy(),
-        "focal_length_px": scene.focal_length_px.numpy(),
-        "side": scene.side.numpy(),
+        "focus_distance_m": conditioning.focus_distance_m.numpy(),
+        "focal_length_px": conditioning.focal_length_px.numpy(),
+        "side": conditioning.side.numpy(),
         **features,
     }
     return expected, feeds

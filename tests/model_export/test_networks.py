@@ -10,7 +10,7 @@ from torch.nn import functional
 from model_export.batch_norms import folded
 from model_export.config import Kind, TrainConfig
 from model_export.losses import STANDING_OUT, Batch, correct, run_pair, standing_out, total_loss
-from model_export.networks import LUMINANCE, BandEnergy, Layout, Scene, Surroundings, make_pair, parameter_count
+from model_export.networks import LUMINANCE, BandEnergy, Conditioning, Layout, Surroundings, make_pair, parameter_count
 from model_export.render import blur
 
 KINDS: list[Kind] = ["compact", "paper"]
@@ -171,7 +171,7 @@ def test_plain_inversion_tells_where_it_is_far_surer_and_hardly_apart(
     cell = torch.ones(1, 1, 16, 16)
     one = torch.ones(1)
     with torch.no_grad():
-        answer = depth(x * cell, spread * cell, Scene(2 * one, 500 * one, 0 * one), (torch.rand(1, 16, 16, 16),))
+        answer = depth(x * cell, spread * cell, Conditioning(2 * one, 500 * one, 0 * one), (torch.rand(1, 16, 16, 16),))
     plain, guess = -math.log1p(x), -math.log(2)
     wanted = plain if told else gate * plain + (1 - gate) * guess
     assert answer.log_ratio_near.mean().item() == pytest.approx(wanted, abs=0.005)
