@@ -15,16 +15,8 @@ from numpy.typing import NDArray
 
 from model_export.cases import FIXED, UNSEEN_K_CAM_PX, VIEWS
 from model_export.datasets.photos import write_image
-from model_export.evaluate import (
-    EQUAL_BLUR_PX,
-    EQUAL_DEFOCUS,
-    KEPT_SHARES,
-    MODES,
-    BlurRange,
-    Pixels,
-    Report,
-    Summary,
-)
+from model_export.evaluate import MODES
+from model_export.summary import EQUAL_BLUR_PX, EQUAL_DEFOCUS, KEPT_SHARES, BlurRange, Pixels, Report, Summary
 from service.inference.preview import render_preview
 
 Table = tuple[list[str], list[list[str]]]

@@ -28,20 +28,9 @@ from model_export.cases import (
 )
 from model_export.cli import commands
 from model_export.corrections import blur_gain, calibrate, temperature, unseen_cases
-from model_export.evaluate import (
-    EQUAL_BLUR_PX,
-    MODES,
-    RIGHT_SIDE,
-    Examiner,
-    Pixels,
-    Relief,
-    Report,
-    Sides,
-    blur_ranges,
-    evaluate,
-    summarise,
-)
+from model_export.evaluate import MODES, RIGHT_SIDE, Examiner, evaluate
 from model_export.report import beside, write
+from model_export.summary import EQUAL_BLUR_PX, Pixels, Relief, Report, Sides, blur_ranges, summarise
 from service.inference.artifact import Interval, load_model_folder, write_manifest
 from service.optics import thin_lens
 from service.optics.camera import Camera
