@@ -208,7 +208,7 @@ def export(
     if out.resolve() == checkpoint.resolve():
         raise _fail(f"{out} would be written over while it is read")
     with _training_parts():
-        from model_export.corrections import ALL_SCENES, calibrate, unseen_cases
+        from model_export.corrections import ALL_SCENES, record_corrections, unseen_cases
         from model_export.export import export_checkpoint
         from model_export.quantized import quantised_graphs
 
@@ -225,7 +225,7 @@ def export(
         cases = list(progress.track(unseen_cases(), ALL_SCENES, description="held-out scenes"))
         found = {}
         for folder in (Path(), Path(INT8)):
-            found[out / folder] = calibrate(built / folder, cases)
+            found[out / folder] = record_corrections(built / folder, cases)
             progress.advance(task)
         shutil.copytree(built, out, dirs_exist_ok=True)
     for folder, (gain, temperature) in found.items():

@@ -38,7 +38,7 @@ def unseen_cases() -> Iterator[Case]:
         yield from procedural_cases(SCENES, side, FIRST)
 
 
-def calibrate(model: Path, cases: Sequence[Case]) -> tuple[float, float]:
+def record_corrections(model: Path, cases: Sequence[Case]) -> tuple[float, float]:
     """Find both for a model folder and write them into its manifest: ``blur_gain`` and ``temperature``.
 
     Blur is that of scenes on either side of focus and on both. Errors are those where the side is told: being on the

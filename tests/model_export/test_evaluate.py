@@ -27,7 +27,7 @@ from model_export.cases import (
     viewed_cases,
 )
 from model_export.cli import commands
-from model_export.corrections import blur_gain, calibrate, temperature, unseen_cases
+from model_export.corrections import blur_gain, record_corrections, temperature, unseen_cases
 from model_export.evaluate import MODES, RIGHT_SIDE, Examiner, evaluate
 from model_export.report import beside, write
 from model_export.summary import EQUAL_BLUR_PX, Pixels, Relief, Report, Sides, blur_ranges, summarise
@@ -280,7 +280,7 @@ def test_what_is_found_is_written_down(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr("model_export.corrections.SCENES", 1)
     monkeypatch.setattr("model_export.corrections.blur_gain", partial(_told, 0.9))
     monkeypatch.setattr("model_export.corrections.temperature", partial(_told, found))
-    assert calibrate(folder, list(unseen_cases())) == (0.9, found)
+    assert record_corrections(folder, list(unseen_cases())) == (0.9, found)
     manifest = load_model_folder(folder).manifest
     assert (manifest.blur_gain, manifest.temperature) == (0.9, found)
 
