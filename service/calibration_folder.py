@@ -10,8 +10,8 @@ from rich.table import Table
 from service.calibration.calibrate import Picture, Task, calibrate
 from service.calibration.fit import Interval
 from service.calibration.report import PictureReport, Report, Role
+from service.file_names import name_column, shown
 from service.inference.images import SUFFIXES, ImageLimits, photographs_in, read_stored_frame
-from service.tables import name_column, shown
 
 REPORT = TypeAdapter(Report)
 

@@ -16,13 +16,13 @@ from service.api.problems import invalid_model
 from service.api.uploads import Upload
 from service.config import Settings
 from service.errors import CamindError
+from service.file_names import name_column, shown
 from service.inference.artifact import load_model_folder
 from service.inference.cancellation import Cancellation
 from service.inference.estimator import Estimator
 from service.inference.images import SUFFIXES, ImageLimits, photographs_in
 from service.memory import keep_freed_memory
 from service.storage.cameras import CameraRecord
-from service.tables import name_column, shown
 
 ENDINGS = {"preview": ".jpg"}  # of the others it is their name
 

@@ -1,4 +1,4 @@
-"""What tables on the command line show of photographs."""
+"""Names of photographs as the command line shows them."""
 
 import os
 
