@@ -17,6 +17,7 @@ from service.optics import thin_lens
 from service.optics.camera import Intrinsics
 
 PHOTOGRAPHS = (8, 12)
+QUANTITIES = (("k_cam", "%"), ("focus distance", "%"), ("gamma", " px"))
 # Fig. 4 of the paper: its k_cam counts k_r = 1, and its blur is 0.3 of that
 PAPER_NUMBERS = (1.39, 5.61, 8.79, 12.69, 22.67, 35.61)
 PAPER_SIGMA = 0.3
@@ -34,31 +35,16 @@ class Trial:
     camera: GridCamera
     report: Report
 
-    def errors(self) -> tuple[float, float, float] | None:
-        """k_cam and focus distance relative, gamma in px."""
+    def against_truth(self) -> list[tuple[Interval, float]]:
+        """What was found of each of ``QUANTITIES``, and its true value; nothing where nothing was."""
         found, camera = self.report.result, self.camera
         if found is None:
-            return None
-        return (
-            found.k_cam_px.value / camera.k_cam_px - 1,
-            found.focus_distance_m.value / camera.focus_distance_m - 1,
-            found.gamma_px.value - camera.gamma_px,
-        )
-
-    def held(self) -> tuple[bool, bool, bool] | None:
-        """Whether the intervals of k_cam, focus distance and gamma hold the truth."""
-        found, camera = self.report.result, self.camera
-        if found is None:
-            return None
-
-        def holds(interval: Interval, truth: float) -> bool:
-            return interval.low <= truth <= interval.high
-
-        return (
-            holds(found.k_cam_px, camera.k_cam_px),
-            holds(found.focus_distance_m, camera.focus_distance_m),
-            holds(found.gamma_px, camera.gamma_px),
-        )
+            return []
+        return [
+            (found.k_cam_px, camera.k_cam_px),
+            (found.focus_distance_m, camera.focus_distance_m),
+            (found.gamma_px, camera.gamma_px),
+        ]
 
 
 def random_camera(seed: int) -> Trial:
@@ -92,18 +78,16 @@ def paper_pairs(number: float, pairs: int) -> list[tuple[Method, Trial]]:
 def error_table(trials: Sequence[Trial]) -> Table:
     """The distribution of errors over cameras, by point spread, and how often the intervals hold."""
     table = Table("point spread", "cameras", "answered", "error of", "median", "95th percentile", "worst", "holds")
-    groups = {"disc": [t for t in trials if t.camera.spread == DISC], "gaussian": [], "all": list(trials)}
-    groups["gaussian"] = [t for t in trials if t.camera.spread != DISC]
-    for name, group in groups.items():
-        errors = [found for trial in group if (found := trial.errors()) is not None]
-        held = [found for trial in group if (found := trial.held()) is not None]
-        for i, (what, unit) in enumerate((("k_cam", "%"), ("focus distance", "%"), ("gamma", " px"))):
-            if not errors:
-                continue
-            amount = np.abs([error[i] for error in errors]) * (100 if unit == "%" else 1)
-            figures = [f"{v:.2f}{unit}" for v in (np.median(amount), np.quantile(amount, 0.95), amount.max())]
-            told = [name, str(len(group)), str(len(errors))] if i == 0 else ["", "", ""]
-            table.add_row(*told, what, *figures, f"{np.mean([hold[i] for hold in held]):.0%}")
+    discs = [trial for trial in trials if trial.camera.spread == DISC]
+    others = [trial for trial in trials if trial.camera.spread != DISC]
+    for name, group in (("disc", discs), ("gaussian", others), ("all", trials)):
+        answers = [found for trial in group if (found := trial.against_truth())]
+        for i, ((what, unit), pairs) in enumerate(zip(QUANTITIES, zip(*answers, strict=True), strict=False)):
+            off = [100 * (found.value / truth - 1) if unit == "%" else found.value - truth for found, truth in pairs]
+            figures = [f"{v:.2f}{unit}" for v in np.quantile(np.abs(off), (0.5, 0.95, 1))]
+            told = [name, str(len(group)), str(len(answers))] if i == 0 else ["", "", ""]
+            holds = np.mean([found.low <= truth <= found.high for found, truth in pairs])
+            table.add_row(*told, what, *figures, f"{holds:.0%}")
     return table
 
 
