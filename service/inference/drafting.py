@@ -13,7 +13,6 @@ from functools import lru_cache
 import lensfunpy
 
 from service.inference.exif import FULL_FRAME_DIAGONAL_MM, Exif
-from service.inference.frame import MOST_ZOOM
 
 SENSOR_WIDTHS_MM = (1.0, 70.0)
 FOCUS_DISTANCES_M = (0.001, 100_000.0)
@@ -58,9 +57,9 @@ def draft_camera(exif: Exif, width_px: int, height_px: int) -> Draft:
     ):
         if value is None:
             warnings.append(words)
-    if _zoom(exif) > MOST_ZOOM:
+    if exif.is_zoomed:
         warnings.append(
-            f"taken with a digital zoom of {exif.digital_zoom:g}: the frame is a part of the sensor's, enlarged, and "
+            f"taken with a digital zoom of {exif.zoom:g}: the frame is a part of the sensor's, enlarged, and "
             "lens.pixel_pitch_um that of what it shows"
         )
     if exif.rendering is not None:
@@ -101,10 +100,6 @@ def _from_lens(exif: Exif, distance_m: float) -> str:
     return ""
 
 
-def _zoom(exif: Exif) -> float:
-    return max(exif.digital_zoom or 1.0, 1.0)
-
-
 def _sensor(exif: Exif, width_px: int, aspect: float, warnings: list[str]) -> tuple[float | None, int | None]:
     """Pitch in µm and width in pixels of the sensor, as if the picture were all of it.
 
@@ -131,7 +126,7 @@ def _sensor(exif: Exif, width_px: int, aspect: float, warnings: list[str]) -> tu
         return None, sensor_width_px
     sensor_width_px = sensor_width_px or width_px
     # a zoom enlarges a part of the sensor to as many pixels
-    return round(1e3 * width_mm / sensor_width_px / _zoom(exif), 4) or None, sensor_width_px
+    return round(1e3 * width_mm / sensor_width_px / exif.zoom, 4) or None, sensor_width_px
 
 
 def _is_cut(exif: Exif, aspect: float) -> bool:
@@ -159,7 +154,7 @@ def _sensor_width_mm(exif: Exif, sensor_width_px: int | None, aspect: float, war
     found = list(_sensor_widths_mm(exif, sensor_width_px, aspect, warnings))
     if not found:
         return None
-    roughest_mm = found[0 if _zoom(exif) > MOST_ZOOM else -1][0]
+    roughest_mm = found[0 if exif.is_zoomed else -1][0]
     width_mm, told = next(one for one in found if _is_about(one[0], roughest_mm))
     if others := ", ".join(f"{other_mm:.3g}" for other_mm, _ in found if not _is_about(other_mm, width_mm)):
         warnings.append(
@@ -197,7 +192,7 @@ def _sensor_widths_mm(
             f"the sensor's size follows from the 35-mm equivalent, {exif.focal_length_35mm:g} mm for "
             f"{exif.focal_length_mm:g}, which is rounded: k_cam may be off by some percent"
         )
-        crops.append((exif.focal_length_35mm / exif.focal_length_mm / _zoom(exif), words))
+        crops.append((exif.focal_length_35mm / exif.focal_length_mm / exif.zoom, words))
     for crop, words in crops:
         width_mm = FULL_FRAME_DIAGONAL_MM / (crop or math.inf) * aspect / math.hypot(aspect, 1)
         if crop and SENSOR_WIDTHS_MM[0] <= width_mm <= SENSOR_WIDTHS_MM[1]:

@@ -14,6 +14,7 @@ SUBJECT_DISTANCE, FOCAL_LENGTH_35MM, LENS_MODEL = 0x9206, 0xA405, 0xA434
 WIDTH, HEIGHT, PLANE_RESOLUTION, PLANE_UNIT = 0xA002, 0xA003, 0xA20E, 0xA210
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 MOST_TEXT = 64
+MOST_ZOOM = 1.01  # of what is none
 FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)  # of what a 35-mm equivalent is seen on
 # what phones write beyond the standard's 0 and 1
 RENDERINGS = {6: "a panorama", 7: "a portrait mode", 8: "a portrait mode"}
@@ -35,6 +36,16 @@ class Exif:
     height_px: int | None = None
     focal_plane_pitch_um: float | None = None
     rendering: str | None = None
+
+    @property
+    def zoom(self) -> float:
+        """How many times a part of the sensor was enlarged; 1 where it was not, or where nothing says so."""
+        return max(self.digital_zoom or 1.0, 1.0)
+
+    @property
+    def is_zoomed(self) -> bool:
+        """Whether the frame is a part of the sensor's, enlarged."""
+        return self.zoom > MOST_ZOOM
 
     @property
     def focus_from_lens_m(self) -> float | None:

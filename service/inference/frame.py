@@ -12,7 +12,6 @@ from service.optics.camera import Camera, Lens
 LENS_TOLERANCE = 0.05
 FOCUS_TOLERANCE = 0.15
 VIEW_TOLERANCE = 1.05
-MOST_ZOOM = 1.01
 SAME_VIEW = 1.25  # equivalents are rounded, and count the whole of a sensor that 16:9 or a square is cut out of
 
 
@@ -62,9 +61,9 @@ def taken_otherwise(exif: Exif, lens: Lens | None, focus_distance_m: float | Non
 
     ``focus_distance_m`` is the camera's where the photograph came without one of its own.
     """
-    zoom = exif.digital_zoom or 1.0
-    if zoom > MOST_ZOOM:
-        yield f"its EXIF says a digital zoom of {zoom:.4g}: the metres hold for a camera registered at that zoom alone"
+    if exif.is_zoomed:
+        said = f"its EXIF says a digital zoom of {exif.zoom:.4g}"
+        yield f"{said}: the metres hold for a camera registered at that zoom alone"
     if exif.rendering is not None:
         yield f"its EXIF says {exif.rendering}: its blur may be computed, and no lens'"
     if lens is not None:
@@ -98,7 +97,7 @@ def maybe_another_part(exif: Exif, camera: Camera) -> Iterator[str]:
     length than the lens' ``taken_otherwise`` tells.
     """
     equivalent_mm, focal_length_m = exif.focal_length_35mm, (exif.focal_length_mm or math.inf) / 1e3
-    if equivalent_mm is None or camera.intrinsics is None or (exif.digital_zoom or 1.0) > MOST_ZOOM:
+    if equivalent_mm is None or camera.intrinsics is None or exif.is_zoomed:
         return
     is_other_lens = abs(focal_length_m / (camera.focal_length_m or focal_length_m) - 1) > LENS_TOLERANCE
     if is_other_lens or focal_length_m >= camera.focus_distance_m:
