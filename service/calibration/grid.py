@@ -116,9 +116,9 @@ def _checked(found: FoundGrid, ratio: float, grid: CircleGrid) -> FoundGrid:
     return FoundGrid(centres, radii, found.seen)
 
 
-def homography(grid: CircleGrid, centres_px: Array) -> Array:
-    """The plane-to-picture map [3,3] that fits all circles best: from millimetres on the sheet to pixels."""
-    matrix, _ = cv2.findHomography(grid.points_mm(), centres_px, 0)
+def homography(points_mm: Array, centres_px: Array) -> Array:
+    """The map [3,3] from millimetres on the sheet to pixels that fits all circles [n,2] best."""
+    matrix, _ = cv2.findHomography(points_mm, centres_px, 0)
     return np.asarray(matrix, np.float64)
 
 
@@ -130,8 +130,8 @@ def projected(matrix: Array, points: Array) -> Array:
 
 def radii_px(grid: CircleGrid, centres_px: Array) -> Array:
     """About how large each circle is in the picture: the geometric mean of its semi-axes [n]."""
-    matrix = homography(grid, centres_px)
     points = grid.points_mm()
+    matrix = homography(points, centres_px)
     step = grid.diameter_mm / 8
     right, down = np.array([step, 0.0]), np.array([0.0, step])
     across = projected(matrix, points + right) - projected(matrix, points - right)
@@ -334,8 +334,8 @@ def _laid(cells: dict[Cell, int], blobs: _Blobs, wanted: list[Cell], grid: Circl
     if not _shows_all_sides(seen.reshape(grid.rows, grid.columns)):
         return None
     if not seen.all():
-        matrix, _ = cv2.findHomography(grid.points_mm()[seen], places[seen], 0)
-        places[~seen] = projected(np.asarray(matrix), grid.points_mm()[~seen])
+        points = grid.points_mm()
+        places[~seen] = projected(homography(points[seen], places[seen]), points[~seen])
     return FoundGrid(places, np.zeros(len(places)), seen)
 
 
