@@ -99,7 +99,7 @@ def _gaussian(sigma: float, radius: int) -> Tensor:
 
 
 class BandEnergy(nn.Module):
-    """Fixed front end: log energy of twelve luminance bands, three an octave, from 0.6 px up, at half size.
+    """Fixed front end: log energy of twelve luminance bands, three an octave, from 0.6 px up: [n,12,h/2,w/2].
 
     Bands are differences of Gaussians on a pyramid whose next level starts where this one's Gaussian has
     doubled, so each octave costs a quarter of the one before; each energy is smoothed at 1.2 px of its level.
