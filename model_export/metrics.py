@@ -1,7 +1,7 @@
 """Scores of depth maps: the paper's, pooled over pixels and averaged over images, with unanswered pixels counted."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,14 +45,12 @@ def score(depth_m: Map, truth_m: Map) -> Scores:
 
 def mean_scores(scores: Sequence[Scores]) -> Scores:
     """The average over images."""
-    rows = [list(s.as_dict().values()) for s in scores]
-    return Scores(*np.mean(rows, axis=0).tolist())
+    return Scores(*np.mean([astuple(s) for s in scores], axis=0).tolist())
 
 
 def pooled_scores(scores: Sequence[Scores], pixels: Sequence[int]) -> Scores:
     """The scores of all images' pixels together, from each image's scores and its number of pixels."""
-    rows = [list(s.as_dict().values()) for s in scores]
-    pooled = Scores(*np.average(rows, axis=0, weights=pixels).tolist())
+    pooled = Scores(*np.average([astuple(s) for s in scores], axis=0, weights=pixels).tolist())
     return replace(pooled, rmse=pooled.mse**0.5)
 
 

@@ -377,30 +377,27 @@ def _opened(
     was learned.
     """
     resume = Checkpoint.load(path) if path.exists() else None
-    if resume is not None and resume.config.taught != bool(teachers):
-        how = "with" if resume.config.taught else "without"
-        raise ValueError(f"{path.parent} was begun {how} a --teacher: go on {how} one")
-    config = replace(config, taught=bool(teachers))
+    start = starting_pair(weights, config.kind) if weights is not None and resume is None else None
+    config, widths = replace(config, taught=bool(teachers)), SHIPPED_WIDTHS
     if resume is not None:
         _require_onward(config, resume, path.parent)
         config = replace(config, settled_share=resume.config.settled_share)
         changed = config.unlike(resume.config)
         if resume.step < config.steps:
             console.print(f"going on from step {resume.step}" + (f", with {', '.join(changed)}" if changed else ""))
-    start = starting_pair(weights, config.kind) if weights is not None and resume is None else None
-    if resume is not None:
-        trainer = Trainer(config, device, resume)
-    elif start is not None:
+    if start is not None:
         widths = Widths.of(start.modules().state_dict())
-        begun = config if fresh_decoders or config.learning == "layout" else replace(config, settled_share=1.0)
-        trainer = Trainer(begun, device, widths=widths)
-    else:
-        trainer = Trainer(config, device)
+        if not fresh_decoders and config.learning != "layout":
+            config = replace(config, settled_share=1.0)
+    trainer = Trainer(config, device, resume, widths)
     trainer.learn_from(*(starting_pair(teacher, config.kind) for teacher in teachers))
     return trainer, start
 
 
 def _require_onward(config: TrainConfig, resume: Checkpoint, run: Path) -> None:
+    if config.taught != resume.config.taught:
+        how = "with" if resume.config.taught else "without"
+        raise ValueError(f"{run} was begun {how} a --teacher: go on {how} one")
     if config.kind != resume.config.kind:
         raise ValueError(f"{run} trains a {resume.config.kind} pair, not a {config.kind} one")
     if config.steps < resume.step:
