@@ -94,7 +94,6 @@ FoundDep = Annotated[CalibrationRecord, Depends(_find)]
                             FOCUSED: {**FILES, "description": "In focus: for the lens' geometry"},
                             DEFOCUSED: {
                                 **FILES,
-                                "minItems": 1,
                                 "description": "Nearer and farther than the focus; of both kinds together at least "
                                 "two must show the sheet, and eight to twelve should, tilted this way and that",
                             },

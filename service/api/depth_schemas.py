@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema
 
 from service.api.texts import Worded, numbers_in
 from service.inference.encode import MAPS, MapName
@@ -124,7 +124,11 @@ class SpreadRead(BaseModel):
 
 
 # whole numbers are written without a point
-Coordinate = Annotated[int | float, BeforeValidator(lambda number: int(number) if number % 1 == 0 else number)]
+Coordinate = Annotated[
+    int | float,
+    BeforeValidator(lambda number: int(number) if number % 1 == 0 else number),
+    WithJsonSchema({"type": "number"}),
+]
 
 
 class PointRead(BaseModel):

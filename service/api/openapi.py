@@ -10,6 +10,7 @@ from fastapi.openapi.utils import get_openapi
 
 from service.access import READING, is_public, needed_scope
 from service.api.problems import PROBLEM_TYPE, STORE_ERRORS, Problem, responses
+from service.api.uploads import BINARY
 from service.errors import (
     CamindError,
     CrossOrigin,
@@ -34,8 +35,8 @@ SECURITY = {
     "scheme": "bearer",
     "description": "An API key from `camind keys create`; not asked for where only the own machine reaches the service",
 }
-# what each event of a calibration holds, as text
-EVENT_DATA = {"contentMediaType": "application/json", "contentSchema": {"$ref": REF.format(model="CalibrationRead")}}
+# of no type: OpenAPI 3.1 knows no items of a stream, and some take the schema for that of one event, others of all
+EVENTS = {"description": "Events, the data of each a `CalibrationRead` in JSON"}
 FRAMEWORK_SCHEMAS = ("HTTPValidationError", "ValidationError")
 REQUEST_ID_REF = {"$ref": "#/components/headers/RequestId"}
 REQUEST_ID = {
@@ -54,12 +55,15 @@ def describe(app: FastAPI) -> dict[str, Any]:
             description=app.description,
             routes=app.routes,
             tags=app.openapi_tags,
+            servers=[{"url": "/"}],
             license_info=app.license_info,
         )
         _add_components(document)
         for path, operations in document["paths"].items():
             for method, operation in operations.items():
-                if not is_public(path):
+                if is_public(path):
+                    operation["security"] = []
+                else:
                     _secure(operation, method.upper(), path)
                 _complete(operation)
         app.openapi_schema = document
@@ -74,6 +78,9 @@ def _add_components(document: dict[str, Any]) -> None:
     problem = Problem.model_json_schema(ref_template=REF)
     schemas.update(problem.pop("$defs", {}))
     schemas["Problem"] = problem
+    for schema in schemas.values():
+        if "prefixItems" in schema:  # pairs of one kind: not every program knows of prefixItems
+            schema["items"] = {"type": schema["prefixItems"][0]["type"]}
     components["headers"] = {"RequestId": REQUEST_ID}
     components["securitySchemes"] = {API_KEY: SECURITY}
 
@@ -88,9 +95,9 @@ def _complete(operation: dict[str, Any]) -> None:
         _add_errors(operation, *BODY_ERRORS)
     for answer in operation["responses"].values():
         for content in answer.get("content", {}).values():
-            if "itemSchema" in content:  # OpenAPI 3.1 knows no items of a stream
-                content["schema"] = content.pop("itemSchema")
-                content["schema"]["properties"]["data"] |= EVENT_DATA
+            if content.pop("itemSchema", None):
+                content["schema"] = EVENTS
+            content.setdefault("schema", BINARY)  # without one clients throw the file away
         answer.setdefault("headers", {})["X-Request-Id"] = REQUEST_ID_REF
 
 

@@ -23,7 +23,7 @@ REQUEST_BODY = {
     "required": True,
     "description": f"The photograph itself, or a form with it in the field `{FIELD}`",
     "content": {
-        **{name: {"schema": BINARY} for name in MEDIA_TYPES},
+        # the form first: of the types beside it some clients know nothing, and others make no working code
         MULTIPART: {
             "schema": {
                 "type": "object",
@@ -33,6 +33,7 @@ REQUEST_BODY = {
             },
             "encoding": {FIELD: {"contentType": ", ".join(MEDIA_TYPES)}},
         },
+        **{name: {"schema": BINARY} for name in MEDIA_TYPES},
     },
 }
 
