@@ -4,6 +4,7 @@ import { KEY_CHANGED, everyCamera, forgetKey, problemOf, storedKey } from "./api
 import { CalibrateView } from "./calibrate.js";
 import { CamerasView } from "./cameras.js";
 import { DepthView } from "./depth.js";
+import "./focus.js";
 import { KeyDialog } from "./key_dialog.js";
 import { ProblemBox, useProblem } from "./problem_box.js";
 import { StatusView } from "./status.js";

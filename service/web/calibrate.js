@@ -92,6 +92,7 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
 	}
 
 	async function start() {
+		if (isSending) return;
 		const form = new FormData();
 		const settings = { pattern: patternOf(sheet), focus_distance_m: focusM, register: false };
 		form.append("settings", JSON.stringify(settings));
@@ -169,7 +170,7 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
 					<button
 						type="button"
 						class="primary"
-						disabled=${isSending || !query || focusM === undefined || name.trim() === "" || !photos.some(({ role }) => role === "defocused")}
+						disabled=${!query || focusM === undefined || name.trim() === "" || !photos.some(({ role }) => role === "defocused")}
 						onClick=${start}
 					>
 						Start the calibration

@@ -44,6 +44,7 @@ export function DraftForm({ file, mediaType, onStored, onFailed }) {
 	/** @param {SubmitEvent} event */
 	async function store(event) {
 		event.preventDefault();
+		if (isStoring) return;
 		setIsStoring(true);
 		setProblem(null);
 		try {
@@ -84,7 +85,7 @@ export function DraftForm({ file, mediaType, onStored, onFailed }) {
 		<${Warnings} texts=${draft.warnings} />
 		<${ProblemBox} problem=${problem} />
 		<div class="row">
-			<button type="submit" class="primary" disabled=${isStoring || missing.length + faults.length > 0}>
+			<button type="submit" class="primary" disabled=${missing.length + faults.length > 0}>
 				Store the camera and read the depth
 			</button>
 			${missing.length > 0 && html`<span class="hint">Fill in ${missing.join(", ")} first.</span>`}

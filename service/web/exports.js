@@ -20,6 +20,7 @@ export function Exports({ result: { asked, file, npz, revision, warnings }, anno
 	const answer = answerName(file.name, format);
 
 	async function download() {
+		if (isBusy) return;
 		setIsBusy(true);
 		setProblem(null);
 		setTold([]);
@@ -74,7 +75,7 @@ export function Exports({ result: { asked, file, npz, revision, warnings }, anno
 			}}
 		/>
 		<div class="row">
-			<button type="button" disabled=${isBusy} onClick=${download}>${isBusy ? "Asking…" : "Download"}</button>
+			<button type="button" onClick=${download}>${isBusy ? "Asking…" : "Download"}</button>
 			<button type="button" onClick=${() => copy(curlCommand)}>Copy as curl</button>
 			<button type="button" onClick=${() => copy(pythonCommand)}>Copy as Python</button>
 		</div>

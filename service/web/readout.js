@@ -1,7 +1,7 @@
 /** What the answer says in words: at the pointer, between two points, and how long it took. */
 
 import { inMetres } from "./numbers.js";
-import { html, useRef } from "./vendor/preact.js";
+import { html } from "./vendor/preact.js";
 
 /** @typedef {import("./maps.js").Reading} Reading */
 
@@ -50,11 +50,6 @@ export function Readout({ reading, focusM }) {
  * }} props
  */
 export function Distance({ marks, measured, hasPoints, onClear }) {
-	const title = useRef(/** @type {HTMLHeadingElement | null} */ (null));
-	const clear = () => {
-		onClear();
-		title.current?.focus();
-	};
 	const says = () => {
 		if (!hasPoints) return "Needs the camera's focal length: give the camera its lens or its intrinsics.";
 		if (marks.length === 0) return "Click two points of the picture.";
@@ -62,7 +57,7 @@ export function Distance({ marks, measured, hasPoints, onClear }) {
 		return measured === "unknown" ? "One of the points has no answer, or no ray meets it by the camera's distortion." : "";
 	};
 	return html`<section class="card stack" aria-label="Distance in space">
-		<h3 tabindex="-1" ref=${title}>Distance in space</h3>
+		<h3>Distance in space</h3>
 		${measured !== null && measured !== "unknown"
 			? html`<p class="depth-metres">
 					<strong data-value="distance">${inMetres(measured.distanceM)} m</strong>${" "}
@@ -70,7 +65,7 @@ export function Distance({ marks, measured, hasPoints, onClear }) {
 				</p>`
 			: html`<p class="hint">${says()}</p>`}
 		${marks.length > 0 &&
-		html`<div class="row"><button type="button" onClick=${clear}>Clear points</button></div>`}
+		html`<div class="row"><button type="button" onClick=${onClear}>Clear points</button></div>`}
 	</section>`;
 }
 

@@ -2,7 +2,7 @@
 
 import { decimal, inMetres } from "./numbers.js";
 import { Choice, TextField } from "./text_field.js";
-import { html, useRef, useState } from "./vendor/preact.js";
+import { html, useState } from "./vendor/preact.js";
 
 /** @typedef {{u: number, v: number, depthM: number}} KnownDepth */
 
@@ -27,7 +27,6 @@ export function Tape({ reader, mark, hasPoints, known, onKnown }) {
 	const [text, setText] = useState("");
 	const [fault, setFault] = useState("");
 	const [way, setWay] = useState("axis");
-	const title = useRef(/** @type {HTMLHeadingElement | null} */ (null));
 
 	/** @param {Event} event */
 	async function add(event) {
@@ -45,7 +44,7 @@ export function Tape({ reader, mark, hasPoints, known, onKnown }) {
 	}
 
 	return html`<section class="card stack" aria-label="Known by a tape">
-		<h3 tabindex="-1" ref=${title}>Known by a tape</h3>
+		<h3>Known by a tape</h3>
 		${mark === null
 			? html`<p class="hint">
 					Click what you have measured, and say how far it is. Two or three things, near and far, tell where the lens was
@@ -75,10 +74,7 @@ export function Tape({ reader, mark, hasPoints, known, onKnown }) {
 					<button
 						type="button"
 						aria-label=${`Forget ${inMetres(one.depthM)} m at ${one.u}, ${one.v}`}
-						onClick=${() => {
-							onKnown(known.filter((other) => other !== one));
-							title.current?.focus();
-						}}
+						onClick=${() => onKnown(known.filter((other) => other !== one))}
 					>
 						Forget
 					</button>

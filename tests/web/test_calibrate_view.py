@@ -120,6 +120,7 @@ def test_every_photograph_says_at_once_what_it_shows(
     assert barriers(page) == []
     nothing.get_by_role("button", name="Remove nothing.png").click()
     expect(shown).to_have_count(1)
+    expect(near.get_by_role("button", name="Remove")).to_be_focused()
     page.set_viewport_size({"width": 360, "height": 740})
     assert page.evaluate(OVERFLOW) <= 0
 

@@ -282,8 +282,9 @@ def test_a_camera_is_deleted_after_a_question(page: Page, served: Server, phone:
     expect(dialog).to_be_hidden()
     assert read(served, phone["name"])["revision"] == 1
     page.get_by_role("button", name="Delete", exact=True).click()
-    dialog.get_by_role("button", name=f"Delete {phone['name']}").click()
+    dialog.get_by_role("button", name=f"Delete {phone['name']}").press("Enter")
     expect(page.get_by_role("button", name=phone["name"])).to_have_count(0)
+    expect(page.locator("main :focus")).to_have_count(1)
     assert served.ask("GET", f"/cameras/{phone['name']}").status == 404
 
 

@@ -1,0 +1,23 @@
+/** Where the focus goes when what has it goes: to what one reaches before that, or else to the tab in front. */
+
+const STOPS = "main :is(a, button, input, select, summary, [tabindex='0'])";
+const WAIT_MS = 100; // the page itself goes first
+
+/** @type {any} */
+let last = null;
+/** @type {any[]} */
+let reached = [];
+
+document.addEventListener("focusin", ({ target }) => {
+	const all = [...document.querySelectorAll(STOPS)];
+	last = target;
+	reached = all.slice(0, all.indexOf(last) + 1);
+});
+
+new MutationObserver(() => setTimeout(keep, WAIT_MS)).observe(document, { childList: true, subtree: true });
+
+function keep() {
+	if (document.activeElement !== document.body || !last || last.checkVisibility()) return;
+	const tab = document.querySelector("nav [tabindex='0']");
+	[tab, ...reached].findLast((one) => one.checkVisibility() && !one.disabled)?.focus({ preventScroll: true });
+}
