@@ -143,7 +143,7 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 		reader.ask("distance", { from: marks[0], to: marks[1] }).then((distance) => {
 			if (!isWanted) return;
 			setMeasured(distance ?? "unknown");
-			if (distance) announce(`The points are ${withError(distance.distanceM, distance.sigmaM)} apart.`);
+			announce(distance ? `The points are ${withError(distance.distanceM, distance.sigmaM)} apart.` : "Their distance is not known.");
 		});
 		return () => {
 			isWanted = false;
@@ -204,11 +204,10 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 				ahead.current = `${name} ${told.revision}`;
 				if (cameras) reloadCameras();
 			}
-			announce(
-				spread
-					? `Depth is ready: ${inMetres(spread.nearM)} to ${inMetres(spread.farM)} metres along the axis.`
-					: "The photograph gives no answer.",
-			);
+			const words = spread
+				? `Depth is ready: ${inMetres(spread.nearM)} to ${inMetres(spread.farM)} metres along the axis`
+				: "The photograph gives no answer";
+			announce([words, ...told.warnings].join(". "));
 		} catch (error) {
 			if (!signal.aborted) fail(error instanceof Problem ? withSize(error) : unreadable(error));
 		}
@@ -225,7 +224,6 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 	function cancel() {
 		running.current?.abort();
 		fail(new Problem({ status: 0, title: "Cancelled.", detail: "The service has stopped working on it." }));
-		announce("Cancelled.");
 	}
 
 	const again = () => setAttempt((count) => count + 1);

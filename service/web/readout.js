@@ -96,7 +96,7 @@ export function Timings({ timings, model }) {
  * @param {Reading} reading
  * @param {number} focusM
  */
-function sideOf(depthM, { otherM, pNear }, focusM) {
+export function sideOf(depthM, { otherM, pNear }, focusM) {
 	const isNear = depthM < focusM;
 	const isDrawnOver = otherM !== null && otherM < focusM === isNear;
 	if (isDrawnOver || (isNear ? pNear : 1 - pNear) < 0.5) {

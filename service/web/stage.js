@@ -2,6 +2,7 @@
 
 import { inMetres, withError } from "./numbers.js";
 import { latest } from "./reader.js";
+import { sideOf } from "./readout.js";
 import { html, useEffect, useMemo, useRef, useState } from "./vendor/preact.js";
 
 /** @typedef {import("./depth.js").Pixel} Pixel */
@@ -66,7 +67,7 @@ export function Stage(props) {
 
 	useEffect(() => {
 		if (!isByKeys.current || reading === null) return undefined;
-		const timer = setTimeout(() => announce(spoken(reading)), STILL_MS);
+		const timer = setTimeout(() => announce(spoken(reading, result?.focusM ?? 0)), STILL_MS);
 		return () => clearTimeout(timer);
 	}, [reading]);
 
@@ -118,12 +119,13 @@ export function Stage(props) {
 	/** @param {Pixel} pixel a third one begins anew */
 	function mark(pixel) {
 		onMarks(marks.length === 1 ? [marks[0], pixel] : [pixel]);
+		announce(`Marked ${pixel.u}, ${pixel.v}.`);
 	}
 
 	/** @param {KeyboardEvent} event */
 	function onKeyDown(event) {
 		if (!result || event.altKey || event.ctrlKey || event.metaKey) return;
-		const { u, v } = reading ?? { u: size.width >> 1, v: size.height >> 1 };
+		const { u, v } = reading ?? marks.at(-1) ?? { u: size.width >> 1, v: size.height >> 1 };
 		const step = event.shiftKey ? Math.ceil(Math.max(size.width, size.height) / LARGE_STEPS) : 1;
 		const moves = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, -step], ArrowDown: [0, step] };
 		const move = /** @type {Record<string, number[]>} */ (moves)[event.key];
@@ -136,6 +138,7 @@ export function Stage(props) {
 		} else if (event.key === "Escape") {
 			onMarks([]);
 			onReading(null);
+			announce("Cleared.");
 		} else {
 			return;
 		}
@@ -274,9 +277,10 @@ function usePaintPx(stage, size) {
 	return px;
 }
 
-/** @param {Reading} reading */
-function spoken({ u, v, depthM, sigmaM, rayLength }) {
+/** @param {Reading} reading @param {number} focusM */
+function spoken(reading, focusM) {
+	const { u, v, depthM, sigmaM, rayLength } = reading;
 	if (depthM === null) return `No answer at ${u}, ${v}.`;
 	const straight = rayLength === null ? "" : ` Straight from the lens ${inMetres(depthM * rayLength)} metres.`;
-	return `${inMetres(depthM)} metres along the axis, give or take ${inMetres(sigmaM ?? 0, depthM)}, at ${u}, ${v}.${straight}`;
+	return `${inMetres(depthM)} metres along the axis, give or take ${inMetres(sigmaM ?? 0, depthM)}, ${sideOf(depthM, reading, focusM)}, at ${u}, ${v}.${straight}`;
 }

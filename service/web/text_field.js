@@ -25,7 +25,7 @@ export function TextField({ id, label, value, onInput, fault = "", hint, onChang
 				onInput=${(/** @type {any} */ event) => onInput(event.target.value)}
 				onChange=${(/** @type {any} */ event) => onChange?.(event.target.value)}
 			/>
-			<span id=${`${id}-told`} class=${fault ? "fault" : "hint"}>${fault || hint}</span>
+			<span id=${`${id}-told`} role=${fault ? "alert" : null} class=${fault ? "fault" : "hint"}>${fault || hint}</span>
 		</div>
 	`;
 }

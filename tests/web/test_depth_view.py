@@ -344,9 +344,46 @@ def test_keys_alone_read_and_measure(measured: Page, maps: Callable[..., Any]) -
     u, v = shown_pixel(measured)
     assert (u, v) == (323 - 33, 217)
     assert number_in(measured, "depth") == pytest.approx(known["depth_m"][v, u], abs=0.0006)
-    expect(measured.get_by_role("status")).to_contain_text(f"{known['depth_m'][v, u]:.3f} metres")
+    said = measured.get_by_role("status")
+    expect(said).to_contain_text(f"{known['depth_m'][v, u]:.3f} metres")
+    expect(said).to_contain_text(measured.locator("[data-value=side]").inner_text())
     picture.press("Enter")
     expect(measured.locator("[data-value=distance]")).to_be_visible()
+    picture.press("Enter")
+    expect(said).to_have_text(f"Marked {u}, {v}.")
+    # read from another side, the cross begins where it was
+    measured.get_by_role("combobox", name="Side of the plane in focus").select_option("near")
+    expect(measured.locator("[data-value=pixel]")).to_have_count(0)
+    picture.press("ArrowRight")
+    assert shown_pixel(measured) == (u, v)
+    picture.press("Escape")
+    expect(said).to_have_text("Cleared.")
+
+
+def test_warnings_are_said_aloud(opened: Page) -> None:
+    choose(opened)
+    pixels = cv2.imread(str(PHOTOGRAPH))
+    assert pixels is not None
+    give(opened, cv2.imencode(".jpg", cv2.resize(pixels, (430, 288)))[1].tobytes())
+    stage(opened)
+    warning = opened.get_by_role("listitem").filter(has_text="430").inner_text()
+    expect(opened.get_by_role("status")).to_contain_text(warning[1:])
+
+
+def test_the_patterns_are_explained_in_the_readers_own_colours(measured: Page) -> None:
+    measured.emulate_media(forced_colors="active")
+    for key in measured.locator(".depth-key").all():
+        expect(key).to_have_css("background-image", re.compile("gradient"))
+
+
+def test_points_that_cannot_be_drawn_for_a_lost_file_are_said_to_be(opened: Page, expected_errors: list[str]) -> None:
+    expected_errors.append(REFUSED)
+    opened.route("**/cloud_worker.js", lambda route: route.abort())
+    choose(opened)
+    give(opened)
+    stage(opened)
+    opened.get_by_role("tab", name="3D").click()
+    expect(opened.get_by_text("only a part of the page: load it again")).to_be_visible()
 
 
 def test_dots_are_where_depth_could_as_well_be_another(measured: Page, maps: Callable[..., Any]) -> None:
@@ -467,7 +504,7 @@ def test_what_a_tape_says_moves_the_focus_and_can_be_forgotten(
     field = known.get_by_label("From the lens to 322, 216 in m")
     field.fill("far")
     add.click()
-    expect(known.get_by_text("This is no distance in metres.")).to_be_visible()
+    expect(known.get_by_role("alert")).to_have_text("This is no distance in metres.")
     field.fill("1,5")
     assert barriers(measured) == []
 
@@ -481,7 +518,7 @@ def test_what_a_tape_says_moves_the_focus_and_can_be_forgotten(
     with measured.expect_response(lambda answer: "/depth?" in answer.url):
         field.press("Enter")
     reads("&known=322,216,1.5")
-    expect(measured.get_by_text("where 2 m was told")).to_be_visible()
+    expect(measured.get_by_text("where 2 m was told")).to_have_count(2)  # seen, and said aloud
     expect(measured.locator(".depth-taped")).to_have_count(1)
     with measured.expect_response(lambda answer: "/depth?" in answer.url):
         known.get_by_role("button", name="Forget 1.500 m at 322, 216").click()
@@ -519,7 +556,7 @@ def test_after_a_failed_reading_one_may_forget_a_depth_or_read_again(
     alert, again = measured.get_by_role("alert"), measured.get_by_role("button", name="Read the depth")
     expect(alert).to_contain_text("The service does not answer.")
     expect(again).to_have_count(0)
-    alert.get_by_role("button", name="Dismiss").click()
+    alert.get_by_role("button", name="Dismiss").press("Enter")
     expect(again).to_be_visible()
     measured.unroute("**/depth?*")
     with measured.expect_request(lambda request: "known=322%2C216%2C1.5" in request.url):
