@@ -48,7 +48,7 @@ function photosOf(files, role) {
  */
 export function useLooks(photos, setPhotos, query) {
 	const next = photos.find(({ asked }) => asked !== query);
-	const asks = !photos.some(lacksKey);
+	const asks = !photos.some(({ problem }) => problem?.status === 401); // one asks for a key, not all
 	useEffect(() => {
 		if (!next || !query) return undefined;
 		const stop = new AbortController();
@@ -57,11 +57,6 @@ export function useLooks(photos, setPhotos, query) {
 		lookAt(next.file, query, asks, stop.signal).then(tell, (error) => stop.signal.aborted || tell(null, problemOf(error)));
 		return () => stop.abort();
 	}, [next?.id, query]);
-}
-
-/** Whether nobody gave the key that it asked for: the others then do not ask. @param {Photo} photo */
-function lacksKey({ problem }) {
-	return problem?.status === 401;
 }
 
 /** @param {File} file @param {string} query @param {boolean} asks @param {AbortSignal} signal @returns {Promise<any>} */
@@ -87,9 +82,11 @@ export function Photographs({ photos, query, focus, onChange, announce }) {
 	const waiting = photos.filter(({ asked }) => asked !== query).length;
 	const seen = photos.filter(({ look }) => look?.found).map(seenOf);
 	const next = adviceFor(seen, focus);
+	const failed = photos.filter(({ problem }) => problem?.isPassing).length;
+	const found = `The sheet is found in ${seen.length} of ${counted(photos.length, "photograph")}${failed ? `, ${failed} not looked at` : ""}`;
 	const [known, setKnown] = useState("");
 	useEffect(() => {
-		if (photos.length > 0 && waiting === 0) announce(`The sheet is found in ${seen.length} of ${counted(photos.length, "photograph")}. ${next}`);
+		if (photos.length > 0 && waiting === 0) announce(`${found}. ${next}`);
 	}, [waiting === 0, photos.length]);
 
 	/** @param {File[]} files @param {Role} role */
@@ -111,7 +108,7 @@ export function Photographs({ photos, query, focus, onChange, announce }) {
 		<div class="notice next">
 			<p>
 				<strong>${next}</strong>
-				${photos.length > 0 && html` <span>${`The sheet is found in ${seen.length} of ${counted(photos.length, "photograph")}; ${WANTED} to 12 make a good set.`}</span>`}
+				${photos.length > 0 && html` <span>${`${found}; ${WANTED} to 12 make a good set.`}</span>`}
 			</p>
 			${known && html`<p class="hint">${known}</p>`}
 			${waiting > 0 && html`<p class="hint">Looking at ${counted(waiting, "photograph")} ...</p>`}
@@ -125,7 +122,7 @@ export function Photographs({ photos, query, focus, onChange, announce }) {
 					isLooking=${photo.asked !== query}
 					hasPartner=${hasPartner(photo, photos)}
 					onRole=${(/** @type {Role} */ role) => onChange((before) => before.map((one) => (one.id === photo.id ? { ...one, role } : one)))}
-					onAgain=${() => onChange((before) => before.map((one) => (one.id === photo.id || lacksKey(one) ? { ...one, asked: "", problem: null } : one)))}
+					onAgain=${() => onChange((before) => before.map((one) => (one.id === photo.id || one.problem?.isPassing ? { ...one, asked: "", problem: null } : one)))}
 					onRemove=${() => onChange((before) => before.filter(({ id }) => id !== photo.id))}
 				/>`,
 			)}
@@ -166,7 +163,7 @@ function DropZone({ role, title, words, onFiles }) {
 		>
 			<h3>${title}</h3>
 			<p class="hint">${words}</p>
-			<button type="button" onClick=${() => input.current?.click()}>Choose photographs</button>
+			<button type="button" aria-label=${`Choose photographs: ${title}`} onClick=${() => input.current?.click()}>Choose photographs</button>
 			<span class="hint">or drop them here</span>
 			<input
 				ref=${input}

@@ -118,7 +118,7 @@ def test_every_photograph_says_at_once_what_it_shows(
     # said where it is read, and aloud
     expect(page.get_by_text(re.compile(r"Next: one at [\d.]+\S[\d.]+ m, tilted by 15 to 25 degrees"))).to_have_count(2)
     assert barriers(page) == []
-    nothing.get_by_role("button", name="Remove nothing.png").click()
+    nothing.get_by_role("button", name="Remove nothing.png").press("Enter")
     expect(shown).to_have_count(1)
     expect(near.get_by_role("button", name="Remove")).to_be_focused()
     page.set_viewport_size({"width": 360, "height": 740})
@@ -254,6 +254,20 @@ def test_a_photograph_that_misses_its_place_does_not_replace_the_page(page: Page
           return ["dragover", "drop"].map((kind) => !document.body.dispatchEvent(drop(kind)));
         }"""
     ) == [True, True]
+
+
+def test_photographs_that_a_lost_connection_left_out_are_looked_at_together(
+    page: Page, photographs: list[Path], name: str, expected_errors: list[str]
+) -> None:
+    expected_errors.append("net::ERR_")
+    to_photographs(page, name)
+    page.context.set_offline(True)
+    page.get_by_role("button", name="Choose photographs: Focus locked").focus()
+    drop(page, *photographs[:2])
+    expect(page.get_by_role("status")).to_contain_text("found in 0 of 2 photographs, 2 not looked at.")
+    page.context.set_offline(False)
+    page.get_by_role("button", name="Look again").first.click()
+    expect(page.get_by_text("found", exact=True)).to_have_count(2)
 
 
 def test_a_file_that_is_no_photograph_is_told(
