@@ -68,7 +68,7 @@ export function CloudView({ reader, result, look, hasPhotograph, isShown }) {
 		return html`<div class="drop">
 			<p>
 				${hasPoints
-					? "This browser has no WebGL2, or no graphics to draw it with. The points are there as PLY, to download."
+					? "This browser has no WebGL2, no graphics to draw it with, or only a part of the page: load it again. The points are there as PLY, to download."
 					: "Points in space need the camera's focal length."}
 			</p>
 		</div>`;
@@ -98,12 +98,13 @@ export function CloudView({ reader, result, look, hasPhotograph, isShown }) {
 
 /**
  * @param {HTMLCanvasElement} canvas which is the worker's from now on
- * @param {() => void} onMissing where there is no WebGL2
+ * @param {() => void} onMissing where there is no WebGL2, or no worker
  * @returns {Worker | null} null where a worker cannot draw
  */
 function drawOn(canvas, onMissing) {
 	if (!canvas.transferControlToOffscreen) return null;
 	const worker = new Worker(new URL("cloud_worker.js", import.meta.url), { type: "module" });
+	worker.onerror = onMissing;
 	worker.onmessage = ({ data }) => {
 		if (data.isMissing) onMissing();
 		else canvas.dataset.points = data.drawn;

@@ -17,7 +17,7 @@ export class DepthReader {
 		/** @type {Error | null} */
 		this.fault = null;
 		this.worker.onerror = () => {
-			const fault = (this.fault = new Error("The page's worker did not start."));
+			const fault = (this.fault = new Error("A part of the page did not come: load it again."));
 			for (const { reject } of this.waiting.values()) reject(fault);
 			this.waiting.clear();
 		};

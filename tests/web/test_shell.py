@@ -73,6 +73,17 @@ def test_the_page_opens_on_the_depth_view(page: Page) -> None:
     selected(page, "Depth")
 
 
+def test_a_page_that_came_in_part_says_so(page: Page, expected_errors: list[str]) -> None:
+    expected_errors.append("net::ERR_")
+    page.route("**/web/ticks.js", lambda route: route.abort())
+    page.goto("")
+    expect(page.get_by_text("If this stays, load the page again.")).to_be_visible()
+    page.unroute("**/web/ticks.js")
+    page.reload()
+    selected(page, "Depth")
+    expect(page.get_by_text("If this stays")).to_have_count(0)
+
+
 def test_tabs_are_addresses(page: Page) -> None:
     page.goto("#cameras")
     selected(page, "Cameras")
