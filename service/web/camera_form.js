@@ -205,14 +205,14 @@ export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 				<button class="primary" disabled=${isSaving}>${base ? "Save as a new revision" : "Create camera"}</button>
 				<button type="button" onClick=${onCancel}>Cancel</button>
 			</div>
-			<section class="stack live" aria-label="What these numbers come to">
-				<div aria-live="polite">${preview && html`<${CameraCurve} camera=${preview} points=${preview.points} />`}</div>
-				${!preview &&
-				html`<p class="hint">
-					${missing.length > 0
-						? `Fill in ${missing.join(", ")} to see what the camera can measure.`
-						: (faults[0]?.detail ?? "Working it out ...")}
-				</p>`}
+			<section class="stack live" aria-label="What these numbers come to" aria-live="polite">
+				${preview
+					? html`<${CameraCurve} camera=${preview} points=${preview.points} />`
+					: html`<p class="hint">
+							${missing.length > 0
+								? `Fill in ${missing.join(", ")} to see what the camera can measure.`
+								: (faults[0]?.detail ?? "Working it out ...")}
+						</p>`}
 			</section>
 		</form>
 	`;
@@ -225,7 +225,7 @@ export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 export function Field({ path, label, value, form = "camera", kind = "decimal", hint, disabled = false, faults, onChange }) {
 	const fault = faults.find(({ pointer }) => pointer === `#/${path}` || pointer.startsWith(`#/${path}/`))?.detail;
 	return html`<${TextField}
-		...${{ id: `${form}-${path.replace("/", "-")}`, label, value, kind, fault, hint, disabled }}
+		...${{ id: `${form}-${path.replace("/", "-")}`, label, value, kind, fault, hint, disabled, role: null }}
 		onInput=${(/** @type {string} */ text) => onChange({ [path]: text })}
 	/>`;
 }

@@ -1,7 +1,7 @@
-/** Where the focus goes when what has it goes: to what one reaches before that, or else to the tab in front. */
+/** Focus that goes with its element is given to what one reaches before, or to the tab in front. */
 
 const STOPS = "main :is(a, button, input, select, summary, [tabindex='0'])";
-const WAIT_MS = 100; // the page itself goes first
+const WAIT_MS = 100; // the page goes first
 
 /** @type {any} */
 let last = null;

@@ -4,10 +4,10 @@ import { html } from "./vendor/preact.js";
 
 /**
  * @param {{id: string, label: string, value: string, onInput: (value: string) => void, fault?: string, hint?: any,
- *   onChange?: (value: string) => void, kind?: string, list?: string, disabled?: boolean, invalid?: boolean}} props
- *   `onChange` is for when the typing is over
+ *   onChange?: (value: string) => void, kind?: string, list?: string, disabled?: boolean, invalid?: boolean, role?: string | null}} props
+ *   `onChange` is for when the typing is over; a fault has the `role`
  */
-export function TextField({ id, label, value, onInput, fault = "", hint, onChange, kind, list, disabled = false, invalid = fault !== "" }) {
+export function TextField({ id, label, value, onInput, fault = "", hint, onChange, kind, list, disabled = false, invalid = fault !== "", role = "alert" }) {
 	return html`
 		<div class="field">
 			<label for=${id}>${label}</label>
@@ -25,7 +25,7 @@ export function TextField({ id, label, value, onInput, fault = "", hint, onChang
 				onInput=${(/** @type {any} */ event) => onInput(event.target.value)}
 				onChange=${(/** @type {any} */ event) => onChange?.(event.target.value)}
 			/>
-			<span id=${`${id}-told`} role=${fault ? "alert" : null} class=${fault ? "fault" : "hint"}>${fault || hint}</span>
+			<span id=${`${id}-told`} role=${fault ? role : null} class=${fault ? "fault" : "hint"}>${fault || hint}</span>
 		</div>
 	`;
 }
