@@ -20,6 +20,7 @@ Kind = Literal["jpeg", "png", "tiff", "webp", "heic", "raw"]
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_READ = frozenset({b"IHDR", b"eXIf", b"acTL", b"cICP", b"iCCP"})
+PNG_ANCILLARY = 0x20  # of a chunk's first letter: no part of the picture (ISO/IEC 15948, 5.4)
 EXIF_SIGNATURE = b"Exif\x00\x00"
 ICC_SIGNATURE, ICC_NUMBERING = b"ICC_PROFILE\x00", 2
 HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"mif1"})
@@ -38,6 +39,7 @@ TIFF_SENSOR = frozenset({32803, 34892})
 CR2_MARK = b"CR"
 MOST_DIRECTORIES = 16
 TIFF_TYPES = {1: "B", 3: "H", 4: "I", 13: "I"}
+TIFF_TYPE_BYTES = dict(enumerate((0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4, 0, 0, 8, 8, 8)))
 # with those that are no whole numbers: a rational is two
 TIFF_NUMBERS = {**TIFF_TYPES, 5: "II", 11: "f", 12: "d"}
 INFINITY = 2**32 - 1  # above a fraction
@@ -181,18 +183,30 @@ def _png(data: bytes) -> Header:
 
 def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
     """Every chunk up to the last, each with the checksum it states."""
+    for name, start, end in _png_places(data):
+        (checksum,) = struct.unpack_from(">I", data, end - 4)
+        if zlib.crc32(memoryview(data)[start + 4 : end - 4]) != checksum:
+            raise InvalidImage(f"The png file is damaged: its {name.decode('latin-1')!r} part fails its checksum.")
+        yield name, data[start + 8 : end - 4] if name in PNG_READ else b""
+
+
+def _png_places(data: bytes) -> Iterator[tuple[bytes, int, int]]:
+    """Every chunk up to the last: its name, where it begins and where it ends."""
     at = len(PNG_SIGNATURE)
     for _ in range(MOST_PARTS):
         length, name = struct.unpack_from(">I4s", data, at)
-        end = at + 8 + length
-        (checksum,) = struct.unpack_from(">I", data, end)
-        if zlib.crc32(memoryview(data)[at + 4 : end]) != checksum:
-            raise InvalidImage(f"The png file is damaged: its {name.decode('latin-1')!r} part fails its checksum.")
-        yield name, data[at + 8 : end] if name in PNG_READ else b""
-        at = end + 4
+        end = at + 12 + length
+        yield name, at, end
+        at = end
         if name == b"IEND":
             return
     raise _too_many_parts("png")
+
+
+def picture_of_png(data: bytes) -> bytes:
+    """A png that ``read_header`` takes without all that its decoder would unpack, and tell the log, for nothing."""
+    places = _png_places(data)
+    return PNG_SIGNATURE + b"".join(data[at:end] for name, at, end in places if not name[0] & PNG_ANCILLARY)
 
 
 def _webp(data: bytes) -> Header:
@@ -244,6 +258,7 @@ def _tiff(data: bytes) -> Header:
         raise UnsupportedKind("A tiff of floating-point numbers is no photograph: send 8 or 16 bits, sRGB.")
     if not set(directory.values(TIFF_BITS)) <= {8, 16}:
         raise UnsupportedKind("A tiff must have 8 or 16 bits a channel.")
+    directory.require_own_bytes()
     _require_usual(directory)
     _require_tiles(directory)
     at = directory.offset_of(TIFF_ORIENTATION)
@@ -323,7 +338,9 @@ class TiffDirectory:
         if count > TIFF_MAX_ENTRIES:
             raise InvalidImage(f"The file's TIFF directory states {count} entries.")
         self._end = start + 2 + 12 * count
-        self._entries = {self._unpack("H", at)[0]: at for at in range(start + 2, self._end, 12)}
+        self._places = range(start + 2, self._end, 12)
+        # of a tag that comes twice, decoders take the first
+        self._entries = {self._unpack("H", at)[0]: at for at in reversed(self._places)}
 
     @property
     def size(self) -> tuple[int, int]:
@@ -347,10 +364,20 @@ class TiffDirectory:
 
     def require_stored(self) -> None:
         """Raises ``InvalidImage`` where its picture leads out of the file."""
+        if any(offset + count > len(self._data) for offset, count in self._stored()):
+            raise cut_off("tiff")
+
+    def require_own_bytes(self) -> None:
+        """Raises ``InvalidImage`` where parts share bytes: each costs a decoder its time and memory anew."""
+        stated = (self._unpack("HI", at + 2) for at in self._places)
+        described = sum(TIFF_TYPE_BYTES.get(kind, 0) * count for kind, count in stated)
+        if described + sum(count for _, count in self._stored()) > len(self._data):
+            raise InvalidImage("The parts that the tiff file states are larger than the file: store it anew.")
+
+    def _stored(self) -> Iterator[tuple[int, int]]:
+        """Where the parts of its picture begin, and their bytes."""
         for offsets, counts in TIFF_STORES:
-            stored = zip(self.values(offsets), self.values(counts), strict=False)
-            if any(offset + count > len(self._data) for offset, count in stored):
-                raise cut_off("tiff")
+            yield from zip(self.values(offsets), self.values(counts), strict=False)
 
     def _unpack(self, form: str, at: int) -> tuple[Any, ...]:
         return struct.unpack_from(self._order + form, self._data, at)

@@ -16,7 +16,7 @@ from service import PIXEL_CEILING
 from service.config import Settings
 from service.errors import InvalidImage, TooLarge, UnsupportedKind
 from service.inference.exif import Exif, read_exif
-from service.inference.headers import Header, Kind, read_header
+from service.inference.headers import Header, Kind, picture_of_png, read_header
 from service.inference.isolated import decode_isolated
 from service.opencv import cv2
 
@@ -176,7 +176,7 @@ def _require_size(width_px: int, height_px: int, limits: ImageLimits) -> None:
 
 def _decode(data: bytes, header: Header) -> tuple[NDArray[np.uint8], tuple[str, ...]]:
     try:
-        pixels = cv2.imdecode(np.frombuffer(_unturned(data, header), np.uint8), DECODE_FLAGS)
+        pixels = cv2.imdecode(np.frombuffer(_picture(data, header), np.uint8), DECODE_FLAGS)
     except cv2.error as exc:
         raise InvalidImage(f"The {header.kind} file cannot be decoded: it is damaged.") from exc
     if pixels is None or pixels.shape[:2] != (header.height_px, header.width_px):
@@ -185,8 +185,10 @@ def _decode(data: bytes, header: Header) -> tuple[NDArray[np.uint8], tuple[str, 
     return np.asarray(cv2.cvtColor(eight_bits, cv2.COLOR_BGR2RGB), np.uint8), warnings
 
 
-def _unturned(data: bytes, header: Header) -> bytes:
-    """The file with no orientation of its own: OpenCV turns every TIFF, whatever it is told."""
+def _picture(data: bytes, header: Header) -> bytes:
+    """The file as it is to be decoded, with no orientation of its own: OpenCV turns every TIFF, whatever it is told."""
+    if header.kind == "png":
+        return picture_of_png(data)
     if header.orientation_offset is None or header.orientation == 1:
         return data
     stored = bytearray(data)

@@ -142,6 +142,17 @@ def tiff(rgb: NDArray[np.uint8] | NDArray[np.uint16], orientation: int = 1, orde
     return head + stored + directory + struct.pack(order + "I", 0)
 
 
+def tiff_with(data: bytes, tags: dict[int, tuple[int, int, int]]) -> bytes:
+    """A little-endian TIFF with more tags: the type, count and value or place of each."""
+    start = int.from_bytes(data[4:8], "little")
+    count = int.from_bytes(data[start : start + 2], "little")
+    entries = [data[at : at + 12] for at in range(start + 2, start + 2 + 12 * count, 12)]
+    entries += [struct.pack("<HHII", tag, *stated) for tag, stated in tags.items()]
+    entries.sort(key=lambda entry: int.from_bytes(entry[:2], "little"))  # stable: what was there comes first
+    directory = struct.pack("<H", len(entries)) + b"".join(entries) + bytes(4)
+    return data[:4] + len(data).to_bytes(4, "little") + data[8:] + directory
+
+
 def hostile_png(side: int = 20_000, bits: int = 1) -> bytes:
     """A valid PNG of side x side black pixels, whole hundreds: some hundred kB at most, and gigabytes decoded."""
     rows = bytes(100 * (1 + -(-side * bits // 8)))

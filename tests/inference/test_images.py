@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import tifffile
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from service.errors import InvalidImage, TooLarge, UnsupportedKind
 from service.inference.exif import Exif, read_exif
@@ -30,6 +31,7 @@ from tests.inference.photographs import (
     png,
     png_chunk,
     tiff,
+    tiff_with,
     webp,
     with_exif,
 )
@@ -254,6 +256,56 @@ def test_a_tile_far_larger_than_its_picture_is_refused() -> None:
     assert entry in data
     with pytest.raises(InvalidImage, match="16x8000000"):
         read_photograph(data.replace(entry, larger))
+
+
+def test_bytes_that_many_parts_of_a_tiff_share_are_decoded_for_none() -> None:
+    data = tiff(np.zeros((1000, 1000, 3), np.uint8)) + bytes(2000)
+    own, shared = (7, 1000, 8), (7, len(data) - 8, 8)  # decoders keep a copy of a tag that they do not know
+    assert read_photograph(tiff_with(data, {60_000: own, 60_001: own})).width_px == 1000
+    before_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(InvalidImage, match="larger than the file"):
+        read_photograph(tiff_with(data, dict.fromkeys(range(60_000, 60_200), shared)))
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kb < 100_000
+
+
+def test_strips_of_a_tiff_share_no_bytes() -> None:
+    out = BytesIO()
+    tifffile.imwrite(out, corners(), photometric="rgb", rowsperstrip=1, metadata=None)
+    data = out.getvalue()
+    assert read_photograph(data).width_px == 64
+    first, *others = tifffile.TiffFile(BytesIO(data)).pages[0].dataoffsets
+    shared = data.replace(struct.pack("<48I", first, *others), struct.pack("<48I", *[first] * 48))
+    larger = shared.replace(struct.pack("<48H", *[64 * 3] * 48), struct.pack("<48H", *[64 * 3 * 48] * 48))
+    assert data != shared != larger
+    with pytest.raises(InvalidImage, match="larger than the file"):
+        read_photograph(larger)
+
+
+def test_of_a_tag_that_comes_twice_the_first_counts_as_it_does_to_the_decoder() -> None:
+    twice = tiff_with(tiff(corners()), {256: (4, 1, 9_000), 257: (4, 1, 9_000)})
+    assert read_photograph(twice).rgb.shape == (48, 64, 3)
+
+
+def test_a_png_is_decoded_without_what_is_no_part_of_its_picture(capfd: pytest.CaptureFixture[str]) -> None:
+    plain = png(corners())
+    forged = png_chunk(b"iCCP", b"x\nFORGED\0\0" + zlib.compress(np.random.default_rng(0).bytes(500)))
+    unpacked = png_chunk(b"zTXt", b"x\0\0" + zlib.compress(bytes(7_000_000), 9)) * 1_000
+    started_s = time.process_time()
+    photograph = read_photograph(plain[:33] + forged + unpacked + plain[33:])
+    assert time.process_time() - started_s < 1
+    np.testing.assert_array_equal(photograph.rgb, read_photograph(plain).rgb)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("mode", ["P", "L", "RGB", "RGBA", "1"])
+def test_a_png_looks_the_same_without_what_is_no_part_of_its_picture(mode: str) -> None:
+    out = BytesIO()
+    told = {"transparency": 0} if mode in ("P", "L") else {}
+    gamma = PngInfo()
+    gamma.add(b"gAMA", struct.pack(">I", 100_000))
+    Image.fromarray(corners()).convert(mode).save(out, "PNG", pnginfo=gamma, **told)
+    seen = cv2.imdecode(np.frombuffer(out.getvalue(), np.uint8), cv2.IMREAD_COLOR_RGB)
+    np.testing.assert_array_equal(read_photograph(out.getvalue()).rgb, seen)
 
 
 def test_a_small_file_of_a_huge_picture_costs_no_memory() -> None:
