@@ -26,6 +26,7 @@ from service.api import (
     photographs,
     target,
 )
+from service.api.clients import Followers
 from service.api.dependencies import require_known_parameters
 from service.api.problems import responses
 from service.api.uploads import Arrivals
@@ -85,6 +86,7 @@ def create_app(settings: Settings, calibrate: Calibrate = calibrate) -> FastAPI:
     app.state.calibrate = calibrate
     app.state.is_stopping = False
     app.state.arrivals = Arrivals((settings.worker_slots + settings.queue_size) * settings.max_image_bytes)
+    app.state.followers = Followers()
     _add_middleware(app, settings)
     handlers.install(app)
     for part in (cameras, depth, photographs, calibrations, look, target):

@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from ipaddress import IPv4Address
 from pathlib import Path
@@ -40,8 +41,16 @@ def settings(settings: Settings) -> Settings:
 
 
 @pytest.fixture
-def app(settings: Settings) -> FastAPI:
-    return create_app(settings, FakeCalibration())
+def fake() -> Iterator[FakeCalibration]:
+    """Answers at once, unless ``go`` is cleared."""
+    made = FakeCalibration()
+    yield made
+    made.go.set()
+
+
+@pytest.fixture
+def app(settings: Settings, fake: FakeCalibration) -> FastAPI:
+    return create_app(settings, fake)
 
 
 @pytest.fixture
@@ -224,13 +233,17 @@ def test_cameras_belong_to_an_owner(client: TestClient, keys: Keys) -> None:
     assert client.get("/cameras/bench", headers=mine).json()["k_cam_px"] == 2.0
 
 
-def test_calibrations_belong_to_an_owner_with_the_camera_they_make(client: TestClient, keys: Keys) -> None:
-    mine, theirs = bearer(keys, "lab"), bearer(keys, "shop")
+def calibrated(client: TestClient, headers: dict[str, str]) -> Response:
     files: list[Part] = [
         ("settings", (None, json.dumps({**SETTINGS, "register": True}), "application/json")),
         ("defocused", ("near.png", png(corners()), "image/png")),
     ]
-    answer = client.post("/calibrate?camera=bench", files=files, headers=mine | {"Prefer": "wait=20"})
+    return client.post("/calibrate?camera=bench", files=files, headers=headers)
+
+
+def test_calibrations_belong_to_an_owner_with_the_camera_they_make(client: TestClient, keys: Keys) -> None:
+    mine, theirs = bearer(keys, "lab"), bearer(keys, "shop")
+    answer = calibrated(client, mine | {"Prefer": "wait=20"})
     assert (answer.status_code, answer.json()["state"]) == (200, "succeeded")
     path = answer.headers["location"]
     for method, end in (("GET", ""), ("GET", "/events"), ("GET", "/plot.svg"), ("DELETE", "")):
@@ -249,6 +262,43 @@ def test_a_new_key_takes_the_place_of_a_revoked_one(client: TestClient, keys: Ke
     keys.revoke(key.id)
     refused(client.get("/cameras/bench", headers=old), 401, "unauthorized")
     assert client.get("/cameras/bench", headers=bearer(keys, "lab")).status_code == 200
+
+
+def test_a_revoked_key_is_told_no_more_of_what_it_follows(
+    client: TestClient, keys: Keys, fake: FakeCalibration
+) -> None:
+    fake.go.clear()
+    key, text = keys.create("first", "lab")
+    old, new = {"Authorization": f"Bearer {text}"}, bearer(keys, "lab")
+    path = calibrated(client, new).headers["location"]
+    with ThreadPoolExecutor(2) as pool:
+        told, untold = (pool.submit(client.get, f"{path}/events", headers=headers) for headers in (new, old))
+        assert fake.has_begun.wait(10)
+        time.sleep(1)
+        keys.revoke(key.id)
+        fake.go.set()
+        assert '"succeeded"' in told.result().text
+        assert '"succeeded"' not in untold.result().text
+
+
+def test_who_follows_is_bounded_for_each_owner(
+    client: TestClient, keys: Keys, fake: FakeCalibration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.api.clients.MOST_FOLLOWERS", 2)
+    fake.go.clear()
+    mine, theirs = bearer(keys, "lab"), bearer(keys, "shop")
+    own, other = (f"{calibrated(client, headers).headers['location']}/events" for headers in (mine, theirs))
+    with ThreadPoolExecutor(3) as pool:
+        following = [pool.submit(client.get, own, headers=mine) for _ in range(2)]
+        time.sleep(1)
+        refused(client.get(own, headers=mine), 503, "busy")
+        not_waited = calibrated(client, mine | {"Prefer": "wait=60"})
+        assert (not_waited.status_code, "preference-applied" in not_waited.headers) == (202, False)
+        following.append(pool.submit(client.get, other, headers=theirs))
+        time.sleep(0.5)
+        fake.go.set()
+        assert all('"succeeded"' in each.result().text for each in following)
+    assert client.get(own, headers=mine).status_code == 200
 
 
 def test_a_key_for_local_opens_what_was_made_without_keys(settings: Settings) -> None:

@@ -22,7 +22,17 @@ from service.api.calibration_schemas import (
 )
 from service.api.calibration_uploads import DEFOCUSED, FOCUSED, FormLimits, receive_form
 from service.api.cursors import Cursor, Limit, cursor_after, name_of
-from service.api.dependencies import CalibrationsDep, IdempotencyKey, RunnerDep, SettingsDep, SpoolDep, require_json
+from service.api.dependencies import (
+    CalibrationsDep,
+    FollowersDep,
+    IdempotencyKey,
+    OwnerDep,
+    RunnerDep,
+    SettingsDep,
+    SpoolDep,
+    count_follower,
+    require_json,
+)
 from service.api.openapi import REF
 from service.api.preferences import MOST_WAIT_S, wait_of
 from service.api.problems import STORE_ERRORS, WRITE_ERRORS, responses
@@ -43,6 +53,7 @@ from service.inference.images import MEDIA_TYPES
 from service.runner import RESULT
 from service.storage.calibrations import ID_PATTERN, CalibrationDraft, CalibrationRecord, Calibrations
 from service.storage.idempotency import once_of
+from service.storage.keys import Keys
 from service.storage.spool import Spool
 
 LOOK_S = 0.2
@@ -116,6 +127,8 @@ async def create_calibration(
     calibrations: CalibrationsDep,
     spool: SpoolDep,
     runner: RunnerDep,
+    owner: OwnerDep,
+    followers: FollowersDep,
     prefer: Annotated[
         str | None, Header(description=f"`wait=SECONDS`, at most {MOST_WAIT_S}: answer when it has ended")
     ] = None,
@@ -129,9 +142,10 @@ async def create_calibration(
     response.headers["Location"] = f"/calibrations/{record.id}"
     wait_s = wait_of(prefer)
     if wait_s is not None:
-        record = await _waited(request.app, calibrations, record, wait_s)
-        response.headers["Preference-Applied"] = f"wait={wait_s}"
-        response.status_code = 200 if record.has_ended else 202
+        with suppress(Busy), followers.counted(owner):
+            record = await _waited(request.app, calibrations, record, wait_s)
+            response.headers["Preference-Applied"] = f"wait={wait_s}"
+            response.status_code = 200 if record.has_ended else 202
     return CalibrationRead.from_record(record)
 
 
@@ -170,13 +184,22 @@ def read_calibration(record: FoundDep) -> CalibrationRead:
     operation_id="followCalibration",
     summary="Follow a calibration",
     response_class=EventSourceResponse,
+    dependencies=[Depends(count_follower)],
     responses=responses(NotFound, *STORE_ERRORS),
 )
 async def follow_calibration(
     request: Request, record: FoundDep, calibrations: CalibrationsDep
 ) -> AsyncIterator[ServerSentEvent]:
-    """The whole calibration as a server-sent event, now and after each change; the stream ends when it has ended."""
+    """The whole calibration as a server-sent event, now and after each change.
+
+    The stream ends when the calibration has ended, or the key is good no more.
+    """
+    keys: Keys = request.app.state.keys
+    key_id = request.state.principal.key_id
     async for now in _changes(request.app, calibrations, record):
+        with suppress(Busy, NotReady):
+            if key_id is not None and not await run_in_threadpool(keys.is_good, key_id):
+                return
         yield ServerSentEvent(data=CalibrationRead.from_record(now), id=str(now.version))
 
 

@@ -1,13 +1,39 @@
 """Work that is done only as long as somebody waits for it."""
 
 import asyncio
-from collections.abc import Awaitable
+from collections import Counter
+from collections.abc import Awaitable, Iterator
+from contextlib import contextmanager
 from typing import TypeVar
 
 from fastapi import Request
 from starlette.requests import ClientDisconnect
 
+from service.errors import Busy
+
 T = TypeVar("T")
+MOST_FOLLOWERS = 20
+
+
+class Followers:
+    """Requests that wait for changes, for each of which the database is asked all the time: bounded for each owner.
+
+    For the event loop alone.
+    """
+
+    def __init__(self) -> None:
+        self._following: Counter[str] = Counter()
+
+    @contextmanager
+    def counted(self, owner: str) -> Iterator[None]:
+        """Count one request more. Raises ``Busy`` where the owner's other ones are as many as may be."""
+        if self._following[owner] >= MOST_FOLLOWERS:
+            raise Busy(f"{MOST_FOLLOWERS} requests of this owner wait for changes already: end one of them first.")
+        self._following[owner] += 1
+        try:
+            yield
+        finally:
+            self._following[owner] -= 1
 
 
 async def unless_gone(request: Request, work: Awaitable[T]) -> T:

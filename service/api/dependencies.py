@@ -3,12 +3,14 @@
 All are coroutines, though they wait for nothing: FastAPI gives each plain function a thread, which costs more.
 """
 
+from collections.abc import AsyncIterator
 from typing import Annotated, get_origin
 
 from fastapi import Depends, Header, Request, params
 from fastapi.dependencies.utils import get_flat_params
 from pydantic import Field
 
+from service.api.clients import Followers
 from service.api.problems import invalid_request
 from service.api.texts import Worded
 from service.config import Settings
@@ -66,6 +68,19 @@ async def get_runner(request: Request) -> Runner:
     return runner
 
 
+async def get_followers(request: Request) -> Followers:
+    followers: Followers = request.app.state.followers
+    return followers
+
+
+async def count_follower(
+    owner: Annotated[str, Depends(get_owner)], followers: Annotated[Followers, Depends(get_followers)]
+) -> AsyncIterator[None]:
+    """Count the request until its answer is whole. Raises ``Busy``."""
+    with followers.counted(owner):
+        yield
+
+
 async def require_known_parameters(request: Request) -> None:
     """Refuse what the query has and the route does not know, and all but lists that come more than once."""
     names = [name for name, _ in request.query_params.multi_items()]
@@ -112,3 +127,5 @@ WorkerDep = Annotated[Worker, Depends(get_worker)]
 CalibrationsDep = Annotated[Calibrations, Depends(get_calibrations)]
 SpoolDep = Annotated[Spool, Depends(get_spool)]
 RunnerDep = Annotated[Runner, Depends(get_runner)]
+OwnerDep = Annotated[str, Depends(get_owner)]
+FollowersDep = Annotated[Followers, Depends(get_followers)]

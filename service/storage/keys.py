@@ -115,6 +115,12 @@ class Keys:
                 self._note_use(key.id, now)
         return key
 
+    def is_good(self, key_id: str) -> bool:
+        """Whether a key that was let in still would be."""
+        with reading(self._engine) as session:
+            row = session.get(ApiKeyRow, key_id)
+            return row is not None and _to_key(row).is_good(datetime.now(UTC))
+
     def _note_use(self, key_id: str, now: datetime) -> None:
         with writing(self._engine) as session:
             row = session.get(ApiKeyRow, key_id)
