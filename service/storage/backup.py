@@ -21,7 +21,7 @@ from sqlalchemy import URL, Select, column, func, make_url, select, table
 from service.errors import NotReady
 from service.storage import schema
 from service.storage.calibrations import Calibrations
-from service.storage.disk import sync_folder, try_lock, write_through
+from service.storage.disk import make_private, sync_folder, try_lock, write_through
 from service.storage.engine import SQLITE_DAMAGED, open_engine
 
 BUSY_TIMEOUT_S = 30.0
@@ -62,7 +62,7 @@ def using(database_url: str | URL) -> Iterator[None]:
     if file is None:
         yield
         return
-    file.parent.mkdir(parents=True, exist_ok=True)
+    make_private(file.parent)
     lock = try_lock(_lock_file(file), is_shared=True)
     if lock is None:
         raise NotReady(f"The database {file} is being restored: start again when that is done.")
@@ -136,7 +136,7 @@ def _lock_file(database: Path) -> Path:
 
 @contextmanager
 def _replacing(database: Path) -> Iterator[None]:
-    database.parent.mkdir(parents=True, exist_ok=True)
+    make_private(database.parent)
     lock = try_lock(_lock_file(database))
     if lock is None:
         raise DatabaseFileError(f"The database {database} is in use: stop the service first.")

@@ -13,6 +13,11 @@ from service.errors import InsufficientStorage, NotReady
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
+def make_private(folder: Path) -> None:
+    """Make a folder that its owner alone can look into; one that is there stays as it is."""
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+
+
 def try_lock(path: Path, *, is_shared: bool = False) -> BinaryIO | None:
     """The file, made if it is not there and locked until it is closed; None while others hold it."""
     file = path.open("ab")

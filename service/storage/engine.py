@@ -1,8 +1,9 @@
 """The database engine: SQLite by default, PostgreSQL by the same URL, both with durable commits."""
 
+import os
 import sqlite3
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
@@ -13,6 +14,7 @@ from sqlalchemy.pool import ConnectionPoolEntry
 from sqlmodel import Session
 
 from service.errors import Busy, CamindError, InsufficientStorage, NotReady
+from service.storage.disk import make_private
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -35,11 +37,21 @@ def open_engine(database_url: str | URL) -> Engine:
     if url.get_backend_name() != "sqlite":
         return _open_postgresql(url)
     if url.database and url.database != ":memory:":
-        Path(url.database).parent.mkdir(parents=True, exist_ok=True)
+        make_private(Path(url.database).parent)
     engine = create_engine(url, pool_timeout=POOL_TIMEOUT_S, hide_parameters=True)
+    event.listen(engine, "do_connect", _make_file_private)
     event.listen(engine, "connect", _prepare_sqlite)
     event.listen(engine, "begin", _begin_sqlite)
     return engine
+
+
+def _make_file_private(_dialect: object, _record: object, arguments: Sequence[str], _options: object) -> None:
+    """What SQLite would make for all to read is made for its owner alone; its journals get the same rights."""
+    file = arguments[0]
+    if not file.startswith((":memory:", "file:")):
+        # SQLite says better why a file cannot be made
+        with suppress(OSError):
+            os.close(os.open(file, os.O_RDONLY | os.O_CREAT, 0o600))
 
 
 def _open_postgresql(url: URL) -> Engine:

@@ -14,7 +14,7 @@ from typing import BinaryIO
 from uuid import uuid4
 
 from service.storage.calibrations import ID_PATTERN
-from service.storage.disk import storing, sync_folder, try_lock, write_through
+from service.storage.disk import make_private, storing, sync_folder, try_lock, write_through
 
 ID_FILE = "spool-id"
 LOCK_FILE = "lock"
@@ -26,7 +26,7 @@ class Spool:
     """The photographs below one folder, which is made if it is not there."""
 
     def __init__(self, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_private(folder)
         self._folder = folder
         self._lock: BinaryIO | None = None
         self._incoming = 0

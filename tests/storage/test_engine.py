@@ -16,6 +16,7 @@ from service.errors import Busy, NotReady
 from service.storage import postgresql, schema
 from service.storage.cameras import Cameras
 from service.storage.engine import journal_mode, open_engine, reading, require_writable, writing
+from service.storage.spool import Spool
 from service.storage.tables import CameraRevisionRow
 
 FULL = 2
@@ -38,6 +39,23 @@ def test_sqlite_is_set_to_keep_what_it_acknowledged(sqlite: Engine) -> None:
         assert pragma("foreign_keys") == 1
         assert pragma("busy_timeout") == 5_000
         assert str(pragma("journal_mode")).upper() == journal_mode()
+
+
+def test_what_is_stored_is_for_its_owner_alone(tmp_path: Path) -> None:
+    before = os.umask(0)
+    try:
+        open_folder = tmp_path / "open"
+        open_folder.mkdir()
+        for folder in (tmp_path / "new", open_folder):
+            engine = open_engine(f"sqlite:///{folder / 'a.sqlite3'}")
+            schema.upgrade(engine)
+            with writing(engine):
+                assert {path.stat().st_mode & 0o777 for path in folder.iterdir()} == {0o600}
+        Spool(open_folder / "calibrations")
+    finally:
+        os.umask(before)
+    private, kept = (folder.stat().st_mode & 0o777 for folder in (tmp_path / "new", open_folder))
+    assert (private, kept, (open_folder / "calibrations").stat().st_mode & 0o777) == (0o700, 0o777, 0o700)
 
 
 def test_the_write_ahead_log_waits_for_a_sound_sqlite() -> None:
