@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import resource
 import signal
 import socket
 import sys
@@ -26,7 +27,9 @@ from service.middleware import REQUEST_ID, request_id_of
 GRACE_S = 1.0
 KEEP_ALIVE_S = 75  # longer than what proxies keep: who closes last is never asked on a connection just closed
 BACKLOG = 2048
+LET_IN = 16  # connections at a time, before one of them is looked at
 MOST_HEADER_BYTES = 65_536
+SPARE_FILES = 256  # of those the process may open: for the database, photographs, decoders, and a burst of connections
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 UNANSWERED = (h11.IDLE, h11.SEND_RESPONSE)
 SIGNALLED = 128  # what a shell adds to the signal that ended a process
@@ -70,7 +73,10 @@ class DeadlineProtocol(H11Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(cast(asyncio.Transport, transport))
-        self._start_clock()
+        if len(self.connections) > most_connections():
+            self.transport.abort()
+        else:
+            self._start_clock()
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._stop_clock()
@@ -171,6 +177,12 @@ class DeadlineProtocol(H11Protocol):
         self.transport.write_eof()
 
 
+def most_connections() -> int:
+    """How many may be open: without files to spare the event loop tries, and says so in the log, without end."""
+    most_files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return max(most_files // 2, most_files - SPARE_FILES)
+
+
 class StoppingServer(uvicorn.Server):
     """Stops in order: the app says so while it still answers, then nobody is let in, then answers are finished.
 
@@ -201,6 +213,11 @@ class StoppingServer(uvicorn.Server):
         self._app.state.is_stopping = True
         self.should_exit = True
 
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        for listener in sockets or ():
+            listener.listen(BACKLOG)  # the event loop has only one number for both
+
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         await asyncio.sleep(self._drain_s)
         await super().shutdown(sockets)
@@ -229,6 +246,7 @@ def serve(app: FastAPI, settings: Settings, listener: socket.socket) -> bool:
     config = uvicorn.Config(
         app,
         http=protocol,
+        backlog=LET_IN,
         h11_max_incomplete_event_size=MOST_HEADER_BYTES,
         ws="none",
         log_config=None,

@@ -2,9 +2,11 @@
 
 import http.client
 import json
+import resource
 import socket
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -120,6 +122,22 @@ def test_a_body_that_grows_too_large_is_refused_while_it_comes(server: Server) -
     connection.request("POST", "/cameras", chunks, headers)
     assert connection.getresponse().status == 413
     connection.close()
+
+
+def test_more_connections_than_files_are_closed_and_others_answered(server: Server) -> None:
+    limits = resource.prlimit(server.process.pid, resource.RLIMIT_NOFILE)
+    resource.prlimit(server.process.pid, resource.RLIMIT_NOFILE, (500, limits[1]))
+    try:
+        with ExitStack() as held:
+            first = held.enter_context(server.connect())
+            for _ in range(600):
+                held.enter_context(server.connect())
+            first.sendall(b"GET /cameras HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
+            assert read_to_end(first)[0] == 200
+        server.poll(lambda: server.ask("GET", "/health/live").status == 200)
+    finally:
+        resource.prlimit(server.process.pid, resource.RLIMIT_NOFILE, limits)
+    assert "out of system resource" not in server.log
 
 
 def test_answers_do_not_wait_for_acknowledgements(server: Server) -> None:
