@@ -40,10 +40,13 @@ class _Exchange:
     status: int | None = None
 
     def stamp(self, message: Message) -> None:
-        """Note the status, and put the request's id on the answer."""
+        """Note the status, and put the request's id on the answer, which no other page may frame or take for a page."""
         if message["type"] == "http.response.start":
             self.status = message["status"]
-            MutableHeaders(scope=message)[REQUEST_ID] = self.request_id
+            headers = MutableHeaders(scope=message)
+            headers[REQUEST_ID] = self.request_id
+            headers.setdefault("Content-Security-Policy", "frame-ancestors 'none'")
+            headers.setdefault("X-Content-Type-Options", "nosniff")
 
 
 class ObserveRequests:

@@ -52,6 +52,13 @@ def test_a_compressed_body_is_refused_by_that_name(client: TestClient) -> None:
     assert plain.status_code == 200
 
 
+@pytest.mark.parametrize("path", ["/docs", "/cameras", "/no-such-thing", "/calibrate/target.svg", "/web/icon.svg", "/"])
+def test_no_answer_is_framed_or_taken_for_another_kind(client: TestClient, path: str) -> None:
+    headers = client.get(path).headers
+    assert "frame-ancestors 'none'" in headers["content-security-policy"]
+    assert headers["x-content-type-options"] == "nosniff"
+
+
 @pytest.mark.parametrize("given", ["abc", "0f8b-4.2_1:x", "a" * 128])
 def test_a_sane_request_id_is_kept(client: TestClient, given: str) -> None:
     assert client.get("/health/live", headers={"X-Request-Id": given}).headers["x-request-id"] == given
