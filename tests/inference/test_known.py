@@ -9,11 +9,13 @@ from numpy.typing import NDArray
 
 from service.inference.artifact import load_model_folder
 from service.inference.cancellation import Cancellation
+from service.inference.copies import Read
 from service.inference.estimator import Estimator
-from service.inference.known import KnownDepth
+from service.inference.known import Clues, KnownDepth
 from service.inference.pair import GraphPair, RawMaps, Side, Sights
 from service.inference.part import Part
 from service.optics.camera import Camera
+from service.optics.focus import Sighting, fit_focus
 from tests.inference.oracle_pair import brightness_for, build_oracle_pair
 
 TOLD = Camera(384, 256, 2.0, 6.0, 0.5)
@@ -79,6 +81,16 @@ def test_a_gamma_that_was_told_wrongly_follows_too(estimator: Estimator) -> None
     assert answer.camera.gamma_px == pytest.approx(1.0, rel=0.15)
     assert answer.camera.focus_distance_m == pytest.approx(1.8, rel=0.05)
     assert any("where 0.5 was told" in warning for warning in answer.warnings)
+
+
+def test_the_interval_told_takes_the_error_of_blur_for_a_laplace_law_s_scale() -> None:
+    blur_px, scale = TRUE.blur_px(LEFT_M), 0.2
+    values = {"blur_px": blur_px, "blur_log_error": np.log(scale), "p_near": 0.9}
+    maps = {name: np.full((128, 192), value, np.float32) for name, value in values.items()}
+    clues = Clues.of(Read(maps, TOLD, Part(0, 0, 384, 256), 2, (1.0,), 22.0), TOLD, "near", KNOWN[:1])
+    fit = fit_focus(TOLD, [Sighting(LEFT_M, blur_px, 2**0.5 * scale)], is_near=True)
+    assert clues.camera.focus_distance_m == pytest.approx(fit.focus_distance_m, rel=1e-3)
+    assert f"({fit.low_m:.3g} to {fit.high_m:.3g})" in clues.warnings[0]
 
 
 def test_a_side_that_is_known_is_that_of_what_is_like_it_and_near_by(estimator: Estimator) -> None:

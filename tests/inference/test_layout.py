@@ -29,11 +29,13 @@ def test_log_odds_are_added_to_probabilities() -> None:
     np.testing.assert_allclose(p_near, expected, rtol=1e-5)
 
 
-def test_certainty_stays_certain_and_a_number() -> None:
+def test_certainty_stays_certain_and_a_number_but_for_more_that_speaks_against_it() -> None:
     p_near = np.array([[0.0, 1.0]], np.float32)
     add_odds(p_near, np.full((1, 1), 3.0, np.float32), (1, 2))
     assert p_near[0, 0] < 1e-4
     assert p_near[0, 1] > 1 - 1e-4
+    add_odds(p_near, np.array([[20.0, -20.0]], np.float32), (1, 2))
+    assert p_near[0, 0] > 0.9 > 0.1 > p_near[0, 1]
 
 
 def test_a_smaller_map_has_the_means_of_what_its_cells_cover() -> None:
