@@ -26,6 +26,7 @@ from service.inference.encode import (
     spread_of,
 )
 from service.inference.png import grey_png
+from service.inference.preview import render_preview
 from service.opencv import cv2
 from service.optics.camera import Camera, Intrinsics
 
@@ -179,17 +180,25 @@ def test_points_leave_the_lens_distortion_out(answer: DepthMap) -> None:
         np.testing.assert_array_equal(stored["distortion"], distortion)
 
 
-def test_what_no_ray_is_distorted_to_is_no_point(answer: DepthMap) -> None:
-    # this lens' polynomial turns back at 1.05 of a focal length from the middle: 40 px of 50
-    folding = replace(
-        answer, camera=replace(CAMERA, intrinsics=Intrinsics(38.0, 38.0, -10.0, 14.5, (-0.3, 0, 0, 0, 0)))
-    )
+@pytest.mark.parametrize(("cx_px", "cy_px"), [(-10.0, 14.5), (49.0, 14.5), (5.0, -15.0), (34.0, 44.0)])
+def test_what_no_ray_is_distorted_to_is_no_point(answer: DepthMap, cx_px: float, cy_px: float) -> None:
+    # this lens' polynomial turns back at 1.05 of a focal length from the middle: 27 px of its picture
+    lens = Intrinsics(38.0, 38.0, cx_px, cy_px, (-0.3, 0, 0, 0, 0))
+    folding = replace(answer, camera=replace(CAMERA, intrinsics=lens))
     told = encode_ply(folding, BESIDE)
     head, _, body = told.body.partition(b"end_header\n")
     points = np.frombuffer(body, np.dtype([(axis, "<f4") for axis in "xyz"] + [(colour, "u1") for colour in "rgb"]))
-    assert 200 < len(points) < np.count_nonzero(answer.valid)
     assert f"element vertex {len(points)}\n".encode() in head
-    assert np.abs(points["x"] / points["z"]).max() < 1.1
+    ahead = np.stack([points[axis] / points["z"] for axis in "xyz"], 1).astype(np.float64)
+    matrix = np.array([[38.0, 0, cx_px], [0, 38.0, cy_px], [0, 0, 1]])
+    places = cv2.projectPoints(ahead, np.zeros(3), np.zeros(3), matrix, np.array(lens.distortion))[0][:, 0]
+    is_point = np.zeros(answer.valid.shape, np.bool_)
+    is_point[tuple(np.rint(places.T[::-1]).astype(int))] = True
+    np.testing.assert_allclose(places, np.rint(places), atol=0.2)
+    v, u = np.indices(is_point.shape)
+    from_middle = np.hypot(u - cx_px, v - cy_px)
+    assert not is_point[from_middle > 27].any()
+    assert is_point[(from_middle < 15) & answer.valid].all()
     left_out = 1 - len(points) / np.count_nonzero(answer.valid)
     assert told.warnings == (
         f"{left_out:.1%} of the points are left out: by the camera's distortion no ray meets the sensor there",
@@ -215,6 +224,18 @@ def test_preview_is_near_red_far_blue_and_grey_without_an_answer(answer: DepthMa
     assert np.ptp(nothing) < 16
     assert near[0] > near[2]
     assert far[2] > far[0]
+
+
+def test_a_preview_s_legend_has_the_near_end_at_the_left_and_each_label_at_its_end() -> None:
+    parts = np.linspace(-0.05, 1.05, 400 * 600, dtype=np.float32).clip(0, 1).reshape(400, 600)
+    # of the same colours: all that differs is the far end's label
+    pixels, farther = (render_preview(far_m**parts).astype(int) for far_m in (2.0, 8.0))
+    bar = pixels[400 - 8 - 3, 8 : 8 + 200]
+    assert bar[4, 0] > bar[4, 2]
+    assert bar[-5, 2] > bar[-5, 0]
+    rows, columns = np.nonzero(np.abs(farther - pixels).max(2) > 40)
+    assert 380 > rows.min() > 360
+    assert 8 + 200 >= columns.max() > columns.min() > 8 + 100
 
 
 @pytest.mark.parametrize("level", [np.nan, 1.5])
