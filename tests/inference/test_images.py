@@ -173,6 +173,14 @@ def test_an_empty_body_is_refused() -> None:
         read_photograph(b"", "image/jpeg")
 
 
+def test_a_raw_file_is_known_by_its_maker_s_mark_or_version_where_its_values_are_not_named() -> None:
+    size, version = struct.pack("<HHIIHHII", 256, 4, 1, 64, 257, 4, 1, 48), struct.pack("<HHII", 50706, 1, 4, 0x401)
+    for mark, entries in ((b"CR\x02\x00", size), (bytes(4), size + version)):
+        data = b"II*\x00\x0c\x00\x00\x00" + mark + struct.pack("<H", len(entries) // 12) + entries + bytes(4)
+        header = read_header(data)
+        assert (header.kind, header.width_px, header.height_px) == ("raw", 64, 48)
+
+
 @pytest.mark.parametrize("declared", ["text/plain", "application/json", "image/gif", "image/svg+xml"])
 def test_a_declared_type_that_is_not_listed_is_refused(declared: str) -> None:
     with pytest.raises(UnsupportedKind, match="image/jpeg"):
@@ -399,6 +407,9 @@ def test_photographs_of_a_folder_are_known_by_how_cameras_name_them(tmp_path: Pa
     assert [path.name for path in photographs_in(tmp_path)] == ["a.JPG", "b.HIF", "c.heic", "d.NEF"]
 
 
+KIND_OF_PAGE, OTHER_TAG = (struct.pack("<HHI", tag, 4, 1) for tag in (254, 253))
+
+
 def pages(*subfiles: int) -> bytes:
     """A tiff of the corners and more pages, each of a kind (1: a smaller copy)."""
     out = BytesIO()
@@ -420,8 +431,8 @@ def animated(kind: str, frames: int) -> bytes:
 
 @pytest.mark.parametrize(
     "data",
-    [pages(0), pages(1, 0), animated(".webp", 3), animated(".png", 2)],
-    ids=["tiff", "tiff with a copy", "webp", "png"],
+    [pages(0), pages(1, 0), pages(0).replace(KIND_OF_PAGE, OTHER_TAG), animated(".webp", 3), animated(".png", 2)],
+    ids=["tiff", "tiff with a copy", "tiff that tells no kinds", "webp", "png"],
 )
 def test_of_several_pictures_the_first_is_read_and_that_is_told(data: bytes) -> None:
     photograph = read_photograph(data)
