@@ -141,6 +141,15 @@ def test_repeated_at_once_it_is_still_done_once(engine: Engine) -> None:
 def test_owners_have_their_own_keys(engine: Engine) -> None:
     assert Cameras(engine, "lab").add(DRAFT, ONCE).revision == 1
     assert Cameras(engine, "shop").add(DRAFT, replace(ONCE, fingerprint="1" * 64)).revision == 1
+    assert [Calibrations(engine, owner).has_done(ONCE.key) for owner in ("lab", "third", None)] == [True, False, False]
+
+
+def test_a_new_key_makes_no_other_forgotten(engine: Engine) -> None:
+    cameras = Cameras(engine)
+    added = cameras.add(DRAFT, ONCE)
+    cameras.add(replace(DRAFT, name="other"), Once("second-try", "1" * 64))
+    Cameras(engine, "lab").add(DRAFT, replace(ONCE, fingerprint="1" * 64))
+    assert cameras.add(DRAFT, ONCE) == added
 
 
 def test_a_key_is_forgotten_after_a_day(engine: Engine) -> None:
