@@ -163,6 +163,8 @@ def test_what_a_lost_service_held_fails_after_a_day(calibrations: Calibrations, 
     with writing(engine) as session:
         yesterday = datetime.now(UTC) - timedelta(days=1, minutes=1)
         session.connection().execute(update(CalibrationRow).values(updated_at=yesterday))
+    calibrations.give_up(SPOOL)
+    assert [calibrations.get(each).state for each in ids] == ["queued", "failed"]
     calibrations.give_up("c" * 32)
     for each in ids:
         read = calibrations.get(each)
@@ -233,6 +235,7 @@ def test_pages_follow_one_another_from_the_newest(calibrations: Calibrations) ->
     middle, _ = calibrations.page(2, after=first[-1].id)
     last, has_more = calibrations.page(2, after=middle[-1].id)
     assert ([item.id for item in last], has_more) == ([ids[0]], False)
+    assert not calibrations.page(5)[1]
     assert calibrations.page(2, after=uuid4().hex) == ([], False)
 
 

@@ -65,6 +65,14 @@ def test_revisions_are_read_from_the_newest_down(cameras: Cameras) -> None:
     assert ([one.draft for one in oldest], has_more) == ([DRAFT], False)
 
 
+def test_revisions_are_those_of_one_camera(cameras: Cameras) -> None:
+    cameras.add(PLAIN)
+    cameras.add(DRAFT)
+    cameras.replace(PLAIN)
+    assert [one.draft for one in cameras.revisions(DRAFT.name, 9)[0]] == [DRAFT]
+    assert [(one.draft, one.revision) for one in cameras.revisions(PLAIN.name, 9)[0]] == [(PLAIN, 2), (PLAIN, 1)]
+
+
 def test_a_taken_name_is_a_conflict(cameras: Cameras) -> None:
     cameras.add(PLAIN)
     with pytest.raises(Conflict):
@@ -100,6 +108,7 @@ def test_pages_follow_one_another(cameras: Cameras) -> None:
     assert ([record.name for record in first], has_more) == (["camera-0", "camera-1"], True)
     last, has_more = cameras.page(2, after="camera-1")
     assert ([record.name for record in last], has_more) == (["camera-2", "camera-4"], False)
+    assert not cameras.page(4)[1]
 
 
 def test_one_of_many_wins_a_name(cameras: Cameras) -> None:

@@ -52,6 +52,8 @@ def test_one_at_a_time_works_it_off(spool: Spool, tmp_path: Path) -> None:
     assert spool.acquire()
     assert spool.acquire()
     assert not other.acquire()
+    other.release()
+    assert not other.acquire()
     spool.release()
     assert other.acquire()
     other.release()
