@@ -13,7 +13,7 @@ import pytest
 import structlog
 from fastapi import FastAPI
 from httpx2 import Response
-from sqlalchemy import Connection, Engine, event
+from sqlalchemy import Connection, Engine, event, update
 from starlette.testclient import TestClient
 
 from model_export.served import serving
@@ -22,7 +22,9 @@ from service.app import create_app
 from service.config import Settings
 from service.errors import BadRequest, NotFound
 from service.principal import SCOPES, Scope
+from service.storage.engine import writing
 from service.storage.keys import Keys
+from service.storage.tables import ApiKeyRow
 from tests.fake_calibration import SETTINGS, FakeCalibration
 from tests.inference.photographs import corners, png
 from tests.test_cli import at_once, camind
@@ -379,6 +381,10 @@ def test_use_is_noted_once_a_minute(engine: Engine) -> None:
     assert first is not None
     assert keys.find(text) is not None
     assert keys.every()[0].last_used_at == first
+    with writing(engine) as session:
+        session.connection().execute(update(ApiKeyRow).values(last_used_at=first - timedelta(seconds=61)))
+    assert keys.find(text) is not None
+    assert (keys.every()[0].last_used_at or first) > first
 
 
 def test_a_wrong_key_costs_what_an_unknown_one_does(engine: Engine) -> None:
@@ -413,8 +419,9 @@ def test_keys_are_found_named_and_revoked(engine: Engine) -> None:
     assert not keys.has_good()
     with pytest.raises(NotFound):
         keys.revoke("0" * 12)
-    with pytest.raises(BadRequest):
-        keys.create("a b", "lab")
+    for names in (("a b", "lab"), ("robot", "a b")):
+        with pytest.raises(BadRequest):
+            keys.create(*names)
 
 
 def test_keys_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
