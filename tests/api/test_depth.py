@@ -180,6 +180,7 @@ def test_json_says_null_and_never_nan(bench: TestClient) -> None:
         ("image/png;q=0, */*;q=0.1", "application/x-npy"),
         ("text/html, application/xhtml+xml, */*;q=0.8", "image/png"),
         ("APPLICATION/JSON; q=1.0", "application/json"),
+        ("application/json; charset=utf-8, image/png;q=0.9", "application/json"),
     ],
 )
 def test_accept_chooses_the_form(bench: TestClient, accept: str, kind: str) -> None:
@@ -288,6 +289,19 @@ def test_a_lens_moves_focus_exactly_but_not_nearer_than_its_focal_length(
     assert problem["errors"][0]["pointer"] == "focus_distance_m"
 
 
+def test_what_focus_that_near_does_to_a_focal_length_from_specs_is_said_of_points_alone(
+    client: TestClient, d200: dict[str, Any]
+) -> None:
+    near = {**d200, "focus_distance_m": 0.25}
+    fx_px = 35e3 / 6.05 * 645 / 3872
+    given = near | {"name": "given", "intrinsics": {"fx_px": fx_px, "fy_px": fx_px, "cx_px": 322.0, "cy_px": 215.5}}
+    for camera in (near, given):
+        assert client.post("/cameras", json=camera).status_code == 201
+    for name, kind, is_warned in (("d200", "npz", True), ("d200", "png", False), ("given", "npz", False)):
+        warned = ask(client, png(grey(60, 432, 645)), camera=name, format=kind).headers["Camind-Warnings"]
+        assert ("fx_px is that of the lens focused far away" in warned) == is_warned, (name, kind)
+
+
 def test_a_photograph_by_another_lens_is_warned_of(client: TestClient, d200: dict[str, Any]) -> None:
     client.post("/cameras", json=d200)
     client.post("/cameras", json={**CAMERA, "image_width_px": 645, "image_height_px": 432})
@@ -298,6 +312,13 @@ def test_a_photograph_by_another_lens_is_warned_of(client: TestClient, d200: dic
     cropped = with_exif(jpeg(grey(60, 432, 645)), exif_of({}, {0x920A: (35, 1), 0xA405: 105}))
     warned = ask(client, cropped, {"Content-Type": "image/jpeg"}, camera="d200").headers["Camind-Warnings"]
     assert warned.startswith("its EXIF says it shows what 105 mm show on 35-mm film, the camera what 53.7 do")
+
+
+def test_a_focus_that_the_photograph_notes_is_no_matter_where_it_is_told_or_follows(bench: TestClient) -> None:
+    noted = with_exif(jpeg(grey()), exif_of({}, {0x9206: (1, 1)}))
+    for told, is_warned in (({}, True), ({"focus_distance_m": 1.9}, False), ({"known": "20,20,1.1"}, False)):
+        warned = ask(bench, noted, {"Content-Type": "image/jpeg"}, **told).headers["Camind-Warnings"]
+        assert ("its EXIF says" in warned) == is_warned, told
 
 
 def test_known_depths_tell_where_this_shot_was_focused(bench: TestClient) -> None:
@@ -435,7 +456,8 @@ def test_what_is_no_part_of_the_photograph_is_refused_by_name(bench: TestClient,
 
 
 def test_a_point_outside_the_part_is_refused(bench: TestClient) -> None:
-    refused(ask(bench, format="json", roi="10,20,41,50", at="9,21"), 422, "(9, 21)", "(10, 20) to (41, 50)")
+    for kind in ("json", "npy"):
+        refused(ask(bench, format=kind, roi="10,20,41,50", at="9,21"), 422, "(9, 21)", "(10, 20) to (41, 50)")
 
 
 def test_a_deadline_that_passes_is_503_with_retry_after(app: FastAPI, bench: TestClient) -> None:
