@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.calibration.fit import Circles, FitError, fit_constants, odd_pictures
+from service.calibration.fit import Circles, FitError, fit_as_paper, fit_constants, odd_pictures, per_circle_k_cam
 from service.optics import thin_lens
 
 K_CAM, GAMMA, FOCUS = 6.0, 0.7, 1.2
@@ -175,3 +175,26 @@ def test_a_picture_a_little_off_with_a_few_wrong_circles_is_not_odd() -> None:
     wrong = replace(some, blur_px=blur)
     found = fit_constants(wrong, resamples=0)
     assert odd_pictures(wrong, found) == []
+
+
+def test_a_circle_tells_k_cam_alone_unless_it_is_in_focus_or_nearly() -> None:
+    some = circles((*BOTH_SIDES, FOCUS), error=0.0)
+    alone = per_circle_k_cam(some, GAMMA, FOCUS)
+    is_out = thin_lens.relative_defocus(some.depth_m, FOCUS) > 0.05
+    np.testing.assert_allclose(alone[is_out], K_CAM, rtol=1e-6)
+    assert np.isnan(alone[~is_out]).all()
+    assert 0 < is_out.sum() < is_out.size
+
+
+@pytest.mark.parametrize("times", [0.6, 1.6])
+def test_the_papers_k_cam_is_what_most_circles_tell(times: float) -> None:
+    some = circles((*BOTH_SIDES, 0.5))
+    is_focused = some.picture == len(BOTH_SIDES)
+    blur = np.where(is_focused, GAMMA, some.blur_px)
+    blur[::12] *= times
+    some = replace(some, blur_px=blur, is_focused=is_focused)
+    found = fit_as_paper(some, FOCUS, depth_error=0.0, resamples=0)
+    assert found.k_cam_px.value == pytest.approx(K_CAM, rel=0.015)
+    assert found.gamma_px.value == pytest.approx(GAMMA)
+    with pytest.raises(FitError, match="focused and of defocused"):
+        fit_as_paper(circles(BOTH_SIDES), FOCUS, depth_error=0.0, resamples=0)
