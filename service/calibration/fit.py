@@ -301,7 +301,7 @@ def _resampled(circles: Circles, fit: Fit, best: Array, focus_m: float | None, d
         row[1] += PIXEL_ERROR_PX * rng.standard_normal()
         row[2] *= 1 + focus_error * rng.standard_normal()
         rows.append(row)
-    return np.maximum(np.array(rows), 0.0)
+    return np.array(rows)
 
 
 def _widening(circles: Circles) -> float:
