@@ -42,8 +42,7 @@ Folder = Annotated[Path, AfterValidator(_expanded)]
 
 def default_data_dir() -> Path:
     """Where the user's data belongs: ``$XDG_DATA_HOME/camind``, by default ``~/.local/share/camind``."""
-    base = os.environ.get("XDG_DATA_HOME") or "~/.local/share"
-    return Path(base).expanduser() / "camind"
+    return Path(os.environ.get("XDG_DATA_HOME") or "~/.local/share") / "camind"
 
 
 def default_otlp_endpoint() -> str:

@@ -57,6 +57,19 @@ def test_folders_may_begin_with_the_user_s_own(monkeypatch: pytest.MonkeyPatch, 
     assert settings.served_model_dir == tmp_path / "model"
 
 
+def test_a_user_without_a_home_is_told_which_folder_to_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nobody(_: int) -> None:
+        raise KeyError
+
+    for name in ("HOME", "XDG_DATA_HOME"):
+        monkeypatch.delenv(name)
+    monkeypatch.setattr("pwd.getpwuid", nobody)
+    with pytest.raises(SettingsError, match=r"^CAMIND_DATA_DIR=.*no such home"):
+        load_settings()
+    monkeypatch.setenv("CAMIND_DATA_DIR", "/somewhere")
+    assert load_settings().data_dir == Path("/somewhere")
+
+
 def test_an_empty_variable_counts_as_none(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CAMIND_PORT", "")
     assert load_settings().port == 8000
