@@ -86,7 +86,8 @@ def serve(
                 _seed(engine, LOCAL)
             if settings.wants_keys:
                 _require_key(settings, engine)
-    typer.echo(f"camind on http://{settings.host}:{listener.getsockname()[1]}", err=True)
+    address = f"[{settings.host}]" if ":" in settings.host else settings.host
+    typer.echo(f"camind on http://{address}:{listener.getsockname()[1]}", err=True)
     if not (settings.is_loopback or settings.wants_keys):
         typer.echo("Other machines can reach it, and it asks nobody who they are.", err=True)
     if not server.serve(served, settings, listener):

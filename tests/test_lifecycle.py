@@ -4,12 +4,14 @@ import http.client
 import json
 import os
 import signal
+import socket
 import sqlite3
 import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -101,6 +103,24 @@ def refused_start(data_dir: Path, model_dir: Path) -> str:
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 1
     return done.stderr
+
+
+def test_the_address_that_it_says_can_be_opened_in_ipv6_too(tmp_path: Path, tiny_model_dir: Path) -> None:
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError:
+        pytest.skip("this machine has no IPv6")
+    environment = {**os.environ, "CAMIND_DATA_DIR": str(tmp_path)}
+    command: list[str | Path] = [CAMIND, "serve", "--host", "::1", "--port", "0", "--model", tiny_model_dir]
+    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        try:
+            told = urlsplit(process.stderr.readline().split()[-1])
+            assert (told.scheme, told.hostname) == ("http", "::1")
+            with socket.create_connection((told.hostname, told.port), timeout=10):
+                pass
+        finally:
+            process.kill()
 
 
 @pytest.mark.parametrize("page", [0, 2])
