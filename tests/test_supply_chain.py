@@ -80,6 +80,12 @@ def test_what_installs_the_service_is_part_of_it() -> None:
     assert pins("pip.txt") == {"pip": pins("service.txt")["pip"]}
 
 
+def test_the_wheel_names_the_licence_of_what_it_brings_along() -> None:
+    shipped = {path.relative_to(ROOT).as_posix() for path in (ROOT / "service").rglob("licences.txt")}
+    assert set(PROJECT["project"]["license-files"]) == {"LICENSE"} | shipped
+    assert PROJECT["project"]["license"] == "Apache-2.0 AND MIT"
+
+
 def test_what_checks_the_page_is_locked_with_hashes() -> None:
     wanted = json.loads((ROOT / "package.json").read_text())
     packages: dict[str, dict[str, str]] = json.loads((ROOT / "package-lock.json").read_text())["packages"]
