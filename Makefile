@@ -1,4 +1,5 @@
 PYTHON ?= python3
+IS_NEW := 'import sys; sys.version_info < (3, 11) and sys.exit("Python 3.11 or newer: make run PYTHON=python3.11")'
 BIN := .venv/bin
 # a module becomes bytecode when it is first imported, which setting up does, and is kept: all that is installed takes as
 # long as to install it
@@ -19,9 +20,11 @@ LOCK := $(BIN)/uv pip compile --quiet --universal --generate-hashes --python-ver
 help: ## Say what each command means
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /|/' | awk -F'|' '{printf "make %-10s %s\n", $$1, $$2}'
 
+# a .venv without pip is what is left where Debian's python3-venv was missing
 .venv/.service: pyproject.toml requirements/pip.txt requirements/service.txt requirements/build.txt
 	@echo "Setting up .venv for the service ..."
-	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	@test -x $(BIN)/pip || $(PYTHON) -c $(IS_NEW)
+	@test -x $(BIN)/pip || $(PYTHON) -m venv --clear .venv
 	@$(INSTALL) requirements/pip.txt
 	@$(INSTALL) requirements/service.txt
 	@$(OURSELVES)

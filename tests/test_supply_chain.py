@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 import threading
@@ -104,6 +105,31 @@ def test_everything_that_installs_asks_for_hashes() -> None:
             is_hashed = "--require-hashes" in line or ("--no-deps" in line and "--build-constraint" in line)
             assert is_hashed or "torch==" in line, line
     assert "$(NPM) ci " in (ROOT / "Makefile").read_text()
+
+
+def set_up(folder: Path, python: str) -> subprocess.CompletedProcess[str]:
+    """Setting up in a folder where a failed attempt left a .venv without pip, by what stands for Python."""
+    shutil.copy(ROOT / "Makefile", folder)
+    shutil.copy(ROOT / "pyproject.toml", folder)
+    shutil.copytree(LOCKS, folder / "requirements")
+    (folder / ".venv" / "bin").mkdir(parents=True)
+    (folder / ".venv" / "bin" / "python").symlink_to(sys.executable)
+    (folder / "python").write_text(f"#!/bin/sh\n{python}\n")
+    (folder / "python").chmod(0o755)
+    command = ["make", ".venv/.service", f"PYTHON={folder}/python"]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+
+
+def test_an_environment_that_has_no_pip_is_made_anew(tmp_path: Path) -> None:
+    done = set_up(tmp_path, 'test "$1" = -c || { echo "$@"; exit 1; }')
+    assert "-m venv --clear .venv" in done.stdout
+
+
+def test_a_python_too_old_is_said_before_anything_is_made(tmp_path: Path) -> None:
+    old = "import sys; sys.version_info = (3, 10, 13); exec(sys.argv[1])"
+    done = set_up(tmp_path, f"exec {sys.executable} -c '{old}' \"$2\"")
+    assert done.returncode != 0
+    assert "\nPython 3.11 or newer: " in done.stderr
 
 
 def test_the_bill_of_materials_names_every_pin(tmp_path: Path) -> None:
