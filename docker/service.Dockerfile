@@ -19,10 +19,11 @@ ENV PATH=/opt/camind/bin:$PATH \
     PYTHONUNBUFFERED=1 \
     CAMIND_DATA_DIR=/data \
     CAMIND_HOST=0.0.0.0 \
+    CAMIND_PORT=8000 \
     CAMIND_LOG_FORMAT=json
 USER 10001
 VOLUME /data
 EXPOSE 8000
-HEALTHCHECK --interval=30s --timeout=3s --start-period=20s CMD ["python3", "-c", "import urllib.request as u; u.urlopen('http://127.0.0.1:8000/health/ready', timeout=2)"]
+HEALTHCHECK --interval=30s --timeout=3s --start-period=20s CMD ["python3", "-c", "import os, urllib.request as u; u.urlopen('http://127.0.0.1:' + os.environ['CAMIND_PORT'] + '/health/ready', timeout=2)"]
 ENTRYPOINT ["camind"]
 CMD ["serve"]

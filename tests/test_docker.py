@@ -86,3 +86,10 @@ def test_the_service_runs_as_nobody_in_particular() -> None:
     assert last["USER"] not in {"root", "0"}
     assert "/health/ready" in last["HEALTHCHECK"]
     assert "read_only: true" in (ROOT / "docker" / "compose.yaml").read_text()
+
+
+def test_health_is_asked_for_at_the_port_that_is_set(tmp_path: Path, tiny_model_dir: Path) -> None:
+    command: list[str] = json.loads(dict(stage(SERVICE, 1))["HEALTHCHECK"].partition("CMD ")[2])
+    with serving(tmp_path / "data", "--model", tiny_model_dir) as server:
+        environment = {**os.environ, "CAMIND_PORT": str(server.port)}
+        subprocess.run([sys.executable, *command[1:]], env=environment, check=True)
