@@ -229,7 +229,7 @@ def test_preview_is_near_red_far_blue_and_grey_without_an_answer(answer: DepthMa
 def test_a_preview_s_legend_has_the_near_end_at_the_left_and_each_label_at_its_end() -> None:
     parts = np.linspace(-0.05, 1.05, 400 * 600, dtype=np.float32).clip(0, 1).reshape(400, 600)
     # of the same colours: all that differs is the far end's label
-    pixels, farther = (render_preview(far_m**parts).astype(int) for far_m in (2.0, 8.0))
+    pixels, farther = (render_preview((far_m**parts).astype(np.float32)).astype(int) for far_m in (2.0, 8.0))
     bar = pixels[400 - 8 - 3, 8 : 8 + 200]
     assert bar[4, 0] > bar[4, 2]
     assert bar[-5, 2] > bar[-5, 0]
