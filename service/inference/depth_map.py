@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.inference.artifact import Manifest
-from service.inference.hypotheses import SIGMA_OF_LAPLACE, merged
+from service.inference.hypotheses import SIGMA_OF_LAPLACE, in_metres, merged
 from service.inference.pair import RawMaps, Side
 from service.inference.part import Part
 from service.inference.resampling import Ratio, bands, sample
@@ -226,7 +226,7 @@ def all_layers(reading: Reading, size: tuple[int, int]) -> Callable[[], Layers]:
         for rows in bands(size):
             error, *maps = _sampled(reading, rows, size[1], "error", "depth_m", "other_m", "p_near", "blur_px")
             layers.depth_m[rows], layers.depth_alt_m[rows], layers.p_near[rows], layers.blur_px[rows] = maps
-            layers.sigma_m[rows] = error * maps[0]
+            layers.sigma_m[rows] = in_metres(error) * maps[0]
             for hidden in (layers.depth_m, layers.depth_alt_m, layers.sigma_m):
                 hidden[rows][error > MAX_RELATIVE_ERROR] = np.nan
         return layers

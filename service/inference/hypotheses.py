@@ -8,6 +8,7 @@ from service.opencv import exp, log
 SIGMA_OF_LAPLACE = np.float32(2**0.5)
 LEAST_P_NEAR = 0.35
 LEAST_DOUBT = np.float32(1e-6)
+ALL_IN_DOUBT = 0.54  # of ln z: its deviation in metres is as large as the depth, and no more is stated
 # x at which log odds of the side count half: chosen on the development sets, 0.05 to 0.17 do as well (docs/training.md)
 HARDLY_OUT = 0.07
 
@@ -52,3 +53,15 @@ def merged(near_m: Array, far_m: Array, p_near: Array, error: Array) -> tuple[Ar
     deviation = np.sqrt(error**2 + probability * pull**2 + (1 - probability) * (2 * half_gap - pull) ** 2)
     depth_m = near_m * exp(half_gap - side * (half_gap - pull))
     return depth_m, deviation, side < 0
+
+
+def in_metres(error: Array) -> Array:
+    """What part of depth its standard deviation in metres is, where ``error`` is that of ln z; above 0 both, 1 at most.
+
+    Of a Laplace law about ln z with standard deviation s the root mean square of what depth is off its median by is
+    s sqrt((1 + s^2) / ((1 - 2 s^2) (1 - s^2 / 2))) of it: more than s, as a depth may be far too small sooner than far
+    too large.
+    """
+    variance = np.square(np.minimum(error, np.float32(ALL_IN_DOUBT)))
+    variance *= (1 + variance) / ((1 - 2 * variance) * (1 - variance / 2))
+    return np.minimum(np.sqrt(variance), np.float32(1))

@@ -13,6 +13,7 @@ from service.inference.artifact import Interval, load_model_folder
 from service.inference.cancellation import Cancellation, Cancelled
 from service.inference.depth_map import LEAST_BLUR_ERROR_PX, Reading, all_layers, decide
 from service.inference.estimator import SURROUNDINGS_PX, Estimator
+from service.inference.hypotheses import in_metres
 from service.inference.known import KnownDepth
 from service.inference.pair import MAPS, GraphPair, RawMaps, Side
 from service.inference.part import Part
@@ -36,6 +37,11 @@ def estimator(folder: Path) -> Estimator:
 
 def grey(level: int, height: int = 64, width: int = 96) -> NDArray[np.uint8]:
     return np.full((height, width, 3), level, np.uint8)
+
+
+def stated(times: float) -> float:
+    """Relative deviation in metres where the network's stated error counts so many times."""
+    return float(in_metres(np.array(times * np.sqrt(2) * LOG_DEPTH_SCALE, np.float32)))
 
 
 def expected_x(level: int, camera: Camera = CAMERA) -> float:
@@ -67,9 +73,8 @@ def test_a_lens_focused_far_away_tells_what_is_near_as_surely_as_one_focused_at_
     assert answer.camera == camera
     np.testing.assert_allclose(answer.depth_m, depth_m, rtol=1e-4)
     by_five_m = thin_lens.depth_at_focus(depth_m, focus_m, 5.0)
-    stated = np.sqrt(2) * LOG_DEPTH_SCALE * depth_m**2 / by_five_m
     floor = thin_lens.depth_error(depth_m, focus_m, camera.k_cam_px, LEAST_BLUR_ERROR_PX)
-    np.testing.assert_allclose(answer.sigma_m, max(stated, floor), rtol=1e-3)
+    np.testing.assert_allclose(answer.sigma_m, max(stated(depth_m / by_five_m) * depth_m, floor), rtol=1e-3)
 
 
 def test_beyond_a_far_focus_depth_ends_where_blur_is_that_of_infinity(estimator: Estimator) -> None:
@@ -91,9 +96,9 @@ def test_what_is_in_focus_is_on_neither_side(estimator: Estimator) -> None:
     np.testing.assert_allclose(found[1], blurred / 255, atol=0.01)
 
 
-def test_sigma_is_root_two_times_the_laplace_scale_times_depth(estimator: Estimator) -> None:
+def test_sigma_is_in_metres_what_root_two_times_the_laplace_scale_is_in_log_depth(estimator: Estimator) -> None:
     answer = estimator.estimate(grey(80), CAMERA, "near")
-    np.testing.assert_allclose(answer.sigma_m, np.sqrt(2) * LOG_DEPTH_SCALE * answer.depth_m, rtol=1e-4)
+    np.testing.assert_allclose(answer.sigma_m, stated(1) * answer.depth_m, rtol=1e-4)
 
 
 def test_blur_is_multiplied_by_the_models_gain(folder: Path) -> None:
@@ -109,7 +114,7 @@ def test_sigma_is_multiplied_by_the_models_temperature(folder: Path) -> None:
     model = load_model_folder(folder)
     warm = replace(model, manifest=model.manifest.model_copy(update={"temperature": 1.5}))
     answer = Estimator.from_folder(warm).estimate(grey(80), CAMERA, "near")
-    np.testing.assert_allclose(answer.sigma_m, 1.5 * np.sqrt(2) * LOG_DEPTH_SCALE * answer.depth_m, rtol=1e-4)
+    np.testing.assert_allclose(answer.sigma_m, stated(1.5) * answer.depth_m, rtol=1e-4)
 
 
 def test_sigma_is_never_below_what_a_twentieth_of_a_pixel_does_to_depth(estimator: Estimator) -> None:
@@ -117,7 +122,8 @@ def test_sigma_is_never_below_what_a_twentieth_of_a_pixel_does_to_depth(estimato
     answer = estimator.estimate(grey(10), weak, "near")
     floor = thin_lens.depth_error(answer.depth_m, 2.0, weak.k_cam_px, LEAST_BLUR_ERROR_PX)
     assert (floor > np.sqrt(2) * LOG_DEPTH_SCALE * answer.depth_m).all()
-    np.testing.assert_allclose(answer.sigma_m, floor, rtol=1e-4)
+    np.testing.assert_allclose(answer.sigma_m, in_metres(floor / answer.depth_m) * answer.depth_m, rtol=1e-4)
+    assert (answer.sigma_m >= floor).all()
 
 
 def test_by_a_k_cam_below_those_that_the_model_knows_errors_grow_until_nothing_is_answered(
@@ -588,7 +594,7 @@ def test_the_depth_graph_is_told_the_side_and_the_camera(
 def test_errors_grow_where_k_cam_is_smaller_than_the_model_knows(estimator: Estimator) -> None:
     weak = Camera(96, 64, 2.0, 0.1, 0.5)
     answer = estimator.estimate(grey(15), weak, "near")
-    np.testing.assert_allclose(answer.sigma_m / answer.depth_m, 5 * np.sqrt(2) * LOG_DEPTH_SCALE, rtol=0.01)
+    np.testing.assert_allclose(answer.sigma_m / answer.depth_m, stated(5), rtol=0.01)
 
 
 def test_what_optics_cannot_tell_has_no_answer(estimator: Estimator) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from service.inference.hypotheses import HARDLY_OUT, LEAST_P_NEAR, SIGMA_OF_LAPLACE, doubted, merged
+from service.inference.hypotheses import HARDLY_OUT, LEAST_P_NEAR, SIGMA_OF_LAPLACE, doubted, in_metres, merged
 
 
 def drawn_truths(near_m: float, far_m: float, p_near: float, error: float) -> NDArray[np.float64]:
@@ -70,3 +70,17 @@ def test_the_side_is_as_sure_as_blur_can_tell(defocus: float, share: float) -> N
 def test_a_sure_side_does_not_overflow() -> None:
     found = doubted(np.array([0, 1, 0, 1], np.float32), np.array([0, 0, 9, 9], np.float32))
     np.testing.assert_allclose(found, [0.5, 0.5, 0, 1], atol=1e-5)
+
+
+def test_a_deviation_in_metres_is_what_depth_is_off_its_median_by() -> None:
+    rng = np.random.default_rng(0)
+    error = np.array([0.02, 0.1, 0.2, 0.3])
+    drawn = np.exp(rng.laplace(0, error / SIGMA_OF_LAPLACE, (2_000_000, 4)))
+    off = np.sqrt(np.mean((drawn - 1) ** 2, 0))
+    np.testing.assert_allclose(in_metres(error.astype(np.float32)), off, rtol=0.01)
+
+
+def test_a_deviation_in_metres_grows_to_the_whole_depth_and_no_further() -> None:
+    found = in_metres(np.linspace(0.01, 1, 100).astype(np.float32))
+    assert (np.diff(found) >= 0).all()
+    assert found[52] < found[53] == found[99] == 1
