@@ -77,7 +77,7 @@ def operations(app: FastAPI) -> Iterator[tuple[str, str, list[str]]]:
     """Every method, path and the scopes its description asks for."""
     for path, item in app.openapi()["paths"].items():
         for method, operation in item.items():
-            scopes = operation["security"][0]["apiKey"] if "security" in operation else []
+            scopes = operation["security"][0]["apiKey"] if operation["security"] else []
             yield method.upper(), path, scopes
 
 
