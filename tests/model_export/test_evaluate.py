@@ -32,6 +32,7 @@ from model_export.evaluate import MODES, RIGHT_SIDE, Examiner, evaluate
 from model_export.report import beside, write
 from model_export.summary import EQUAL_BLUR_PX, Pixels, Relief, Report, Sides, blur_ranges, summarise
 from service.inference.artifact import Interval, load_model_folder, write_manifest
+from service.inference.hypotheses import in_metres
 from service.optics import thin_lens
 from service.optics.camera import Camera
 from tests.inference.oracle_pair import LOG_DEPTH_SCALE, RELATIVE_BLUR_ERROR, blur_of, build_oracle_pair
@@ -195,7 +196,8 @@ def test_a_picture_that_cannot_be_read_ends_the_evaluation_and_is_told_of(tiny_m
 def test_certainty_and_blur_are_scored_where_they_are_known(oracle: Examiner) -> None:
     known = replace(case(1.0), blur_px=np.full((64, 96), blur_of(LEVEL) * 0.8, np.float32))
     outcome, _ = oracle.answer(known)
-    assert outcome.depth.stated == pytest.approx(LOG_DEPTH_SCALE * 2**0.5, rel=1e-3)
+    stated = in_metres(np.array(LOG_DEPTH_SCALE * 2**0.5, np.float32))
+    assert outcome.depth.stated == pytest.approx(float(stated), rel=1e-3)
     assert outcome.blur is not None
     assert outcome.blur.stated == pytest.approx(RELATIVE_BLUR_ERROR * 2**0.5, rel=1e-3)
     (found,) = (row for row in blur_ranges("grey", outcome.blur) if row.low_px == 2.0)
