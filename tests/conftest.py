@@ -16,6 +16,7 @@ from service.storage import schema
 from service.storage.cameras import Cameras
 from service.storage.engine import open_engine
 from tests import postgres
+from tests.fake_calibration import FakeCalibration
 from tests.inference.oracle_pair import build_oracle_pair
 
 
@@ -47,6 +48,14 @@ def settings(tmp_path: Path, tiny_model_dir: Path) -> Settings:
         max_image_bytes=2_000_000,
         receive_deadline_s=5,
     )
+
+
+@pytest.fixture
+def fake() -> Iterator[FakeCalibration]:
+    """Answers at once, unless ``go`` is cleared."""
+    made = FakeCalibration()
+    yield made
+    made.go.set()
 
 
 @pytest.fixture

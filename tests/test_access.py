@@ -43,14 +43,6 @@ def settings(settings: Settings) -> Settings:
 
 
 @pytest.fixture
-def fake() -> Iterator[FakeCalibration]:
-    """Answers at once, unless ``go`` is cleared."""
-    made = FakeCalibration()
-    yield made
-    made.go.set()
-
-
-@pytest.fixture
 def app(settings: Settings, fake: FakeCalibration) -> FastAPI:
     return create_app(settings, fake)
 

@@ -2,7 +2,6 @@
 
 import json
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -34,14 +33,6 @@ Part = tuple[str, tuple[str | None, bytes | str, str]]
 def settings(settings: Settings) -> Settings:
     limits = {"max_calibration_images": 4, "max_image_bytes": 50_000, "max_calibration_bytes": 200_000}
     return settings.model_copy(update={**limits, "calibration_queue_size": 3})
-
-
-@pytest.fixture
-def fake() -> Iterator[FakeCalibration]:
-    """Answers at once, unless ``go`` is cleared."""
-    made = FakeCalibration()
-    yield made
-    made.go.set()
 
 
 @pytest.fixture
