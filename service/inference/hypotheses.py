@@ -8,7 +8,8 @@ from service.opencv import exp, log
 SIGMA_OF_LAPLACE = np.float32(2**0.5)
 LEAST_P_NEAR = 0.35
 LEAST_DOUBT = np.float32(1e-6)
-ALL_IN_DOUBT = 0.54  # of ln z: its deviation in metres is as large as the depth, and no more is stated
+ALL_IN_DOUBT = 0.54  # of ln z: its deviation in metres is as large as the depth
+MOST_IN_METRES = 0.95  # of depth: what is in such doubt grows but slowly from there, to the whole depth
 # x at which log odds of the side count half: chosen on the development sets, 0.05 to 0.17 do as well (docs/training.md)
 HARDLY_OUT = 0.07
 
@@ -56,12 +57,12 @@ def merged(near_m: Array, far_m: Array, p_near: Array, error: Array) -> tuple[Ar
 
 
 def in_metres(error: Array) -> Array:
-    """What part of depth its standard deviation in metres is, where ``error`` is that of ln z; above 0 both, 1 at most.
+    """What part of depth its standard deviation in metres is, where ``error`` is that of ln z; from 0 to 1 both.
 
     Of a Laplace law about ln z with standard deviation s the root mean square of what depth is off its median by is
     s sqrt((1 + s^2) / ((1 - 2 s^2) (1 - s^2 / 2))) of it: more than s, as a depth may be far too small sooner than far
-    too large.
+    too large. That has no bound; no more is stated than 0.95 + 0.05 s, so that of two depths the surer one stays it.
     """
     variance = np.square(np.minimum(error, np.float32(ALL_IN_DOUBT)))
     variance *= (1 + variance) / ((1 - 2 * variance) * (1 - variance / 2))
-    return np.minimum(np.sqrt(variance), np.float32(1))
+    return np.minimum(np.sqrt(variance), MOST_IN_METRES + (1 - MOST_IN_METRES) * error)
