@@ -3,14 +3,16 @@
 import threading
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from http import HTTPStatus
+from http.client import HTTPConnection
 
 import cv2
 import numpy as np
 
 from model_export.bench_graphs import FRAME_K_CAM_PX, NATIVE_K_CAM_PX, SIZE, Timing, draw_picture
-from model_export.served import Reply, Server
+from model_export.served import Reply, Server, ask_over
 
 CLIENTS = (1, 2, 4, 8, 16)
 FULL_SIZE = (4000, 3000)
@@ -35,7 +37,7 @@ class RequestRow:
 
 
 def time_frames(server: Server, rounds: int, on_round: Callable[[], None]) -> RequestRow:
-    """A 640x480 frame, as a robot sends them."""
+    """A 640x480 frame, as a robot sends them: one after the other over one connection."""
     row = _timed(server, "frame", SIZE, FRAME_K_CAM_PX, rounds)
     on_round()
     return row
@@ -54,12 +56,13 @@ def _timed(server: Server, camera: str, size: tuple[int, int], k_cam_px: float, 
     _register(server, camera, size, k_cam_px)
     body = _jpeg(*size)
     seconds, told = [], []
-    for number in range(rounds + 1):
-        started = time.perf_counter()
-        reply = _ask(server, camera, body)
-        if number:
-            seconds.append(time.perf_counter() - started)
-            told.append(_stages(reply))
+    with closing(server.keep_connection()) as connection:
+        for number in range(rounds + 1):
+            started = time.perf_counter()
+            reply = _ask(connection, camera, body)
+            if number:
+                seconds.append(time.perf_counter() - started)
+                told.append(_stages(reply))
     stages = {stage: float(np.median([each[stage] for each in told])) for stage in told[0]}
     around = [1e3 * s - each["blur"] - each["depth"] for s, each in zip(seconds, told, strict=True)]
     label = f"{size[0]}x{size[1]}, k_cam {k_cam_px:g} px"
@@ -78,8 +81,8 @@ def _register(server: Server, name: str, size: tuple[int, int], k_cam_px: float)
     )
 
 
-def _ask(server: Server, camera: str, body: bytes) -> Reply:
-    return server.ask("POST", f"/depth?camera={camera}", body, {"Content-Type": "image/jpeg"})
+def _ask(connection: HTTPConnection, camera: str, body: bytes) -> Reply:
+    return ask_over(connection, "POST", f"/depth?camera={camera}", body, {"Content-Type": "image/jpeg"})
 
 
 def _stages(reply: Reply) -> dict[str, float]:
@@ -138,7 +141,8 @@ def time_load(server: Server, seconds: float, on_round: Callable[[], None] = lam
 
 
 def _client(server: Server, body: bytes, stop: float, seen: list[tuple[Reply, float]]) -> None:
-    while time.monotonic() < stop:
-        started = time.perf_counter()
-        reply = _ask(server, "load", body)
-        seen.append((reply, time.perf_counter() - started))
+    with closing(server.keep_connection()) as connection:
+        while time.monotonic() < stop:
+            started = time.perf_counter()
+            reply = _ask(connection, "load", body)
+            seen.append((reply, time.perf_counter() - started))

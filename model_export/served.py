@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -31,6 +31,20 @@ class Reply:
     def json(self) -> dict[str, Any]:
         content: dict[str, Any] = json.loads(self.body)
         return content
+
+
+def ask_over(
+    connection: http.client.HTTPConnection,
+    method: str,
+    path: str,
+    body: bytes | str | None = None,
+    headers: dict[str, str] | None = None,
+) -> Reply:
+    """One request over a connection that stays open."""
+    connection.request(method, path, body, headers or {})
+    answer = connection.getresponse()
+    found = {name.lower(): value for name, value in answer.getheaders()}
+    return Reply(answer.status, found, answer.read())
 
 
 class Server:
@@ -74,14 +88,13 @@ class Server:
     def ask(
         self, method: str, path: str, body: bytes | str | None = None, headers: dict[str, str] | None = None
     ) -> Reply:
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=ANSWER_S)
-        try:
-            connection.request(method, path, body, headers or {})
-            answer = connection.getresponse()
-            found = {name.lower(): value for name, value in answer.getheaders()}
-            return Reply(answer.status, found, answer.read())
-        finally:
-            connection.close()
+        """One request over a connection of its own."""
+        with closing(self.keep_connection()) as connection:
+            return ask_over(connection, method, path, body, headers)
+
+    def keep_connection(self) -> http.client.HTTPConnection:
+        """A connection for one request after the other, to be closed."""
+        return http.client.HTTPConnection("127.0.0.1", self.port, timeout=ANSWER_S)
 
     def add(self, camera: Mapping[str, Any]) -> int:
         """Register a camera; the status."""

@@ -142,7 +142,7 @@ class GraphPair:
     def _padded(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
         """float32 [1, 3, h, w] in 0..1, mirrored at the right and bottom up to the next multiple."""
         bottom, right = (-size % self.manifest.multiple for size in rgb.shape[:2])
-        padded = cv2.copyMakeBorder(rgb, 0, bottom, 0, right, cv2.BORDER_REFLECT)
+        padded = cv2.copyMakeBorder(rgb, 0, bottom, 0, right, cv2.BORDER_REFLECT) if bottom or right else rgb
         image = np.empty((1, 3, *padded.shape[:2]), np.float32)
         for channel, plane in enumerate(cv2.split(padded)):
             np.divide(plane, np.float32(255), out=image[0, channel])
