@@ -1,6 +1,7 @@
 """uvicorn with what it lacks: a deadline for headers that never end, and problem+json for what is no HTTP."""
 
 import asyncio
+import errno
 import os
 import resource
 import signal
@@ -32,13 +33,14 @@ MOST_HEADER_BYTES = 65_536
 SPARE_FILES = 256  # of those the process may open: for the database, photographs, decoders, and a burst of connections
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 UNANSWERED = (h11.IDLE, h11.SEND_RESPONSE)
+PORTS_FAULTS = (errno.EADDRINUSE, errno.EACCES)
 SIGNALLED = 128  # what a shell adds to the signal that ended a process
 
 
 log = structlog.stdlib.get_logger("camind.request")
 
 
-class PortTakenError(OSError):
+class CannotListenError(OSError):
     """The address cannot be bound; the message says which and what to do."""
 
 
@@ -224,7 +226,7 @@ class StoppingServer(uvicorn.Server):
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """A listening socket. Raises ``PortTakenError``, before anything slow was loaded."""
+    """A listening socket. Raises ``CannotListenError``, before anything slow was loaded."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     # without the protocol's number asyncio leaves Nagle's delay on: 40 ms an answer
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
@@ -234,7 +236,8 @@ def bind(host: str, port: int) -> socket.socket:
         listener.listen(BACKLOG)
     except OSError as exc:
         listener.close()
-        raise PortTakenError(f"Cannot listen on {host}:{port} ({exc.strerror}): choose another --port.") from exc
+        option = "--port" if exc.errno in PORTS_FAULTS else "--host"
+        raise CannotListenError(f"Cannot listen on {host}:{port} ({exc.strerror}): choose another {option}.") from exc
     return listener
 
 

@@ -20,7 +20,7 @@ from sqlalchemy import update
 from sqlmodel import col
 from typer.testing import CliRunner, Result
 
-from service import cli
+from service import cli, server
 from service.api.schemas import LENS_EXAMPLE
 from service.config import Settings
 from service.storage import schema
@@ -72,6 +72,12 @@ def test_a_taken_port_is_said(tmp_path: Path, tiny_model_dir: Path) -> None:
     assert f"127.0.0.1:{port}" in done.stderr
     assert "--port" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("host", ["203.0.113.1", "no.such.host.invalid"])
+def test_an_address_that_is_not_this_machine_s_is_no_matter_of_the_port(host: str) -> None:
+    with pytest.raises(OSError, match=f"Cannot listen on {host}:0 .* choose another --host"):
+        server.bind(host, 0)
 
 
 def test_a_broken_model_is_said(tmp_path: Path) -> None:
