@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from model_export.bench_graphs import FRAME_K_CAM_PX, NATIVE_K_CAM_PX, SIZE, Timing, draw_picture
-from model_export.served import Reply, Server, ask_over
+from model_export.started_server import Reply, Server, ask_over
 
 CLIENTS = (1, 2, 4, 8, 16)
 FULL_SIZE = (4000, 3000)

@@ -14,7 +14,7 @@ from model_export import bench_graphs, bench_seams, bench_service
 from model_export.bench_graphs import SIZE, THREADS, NetworkRow, Rate, SizeRow, Timing
 from model_export.bench_seams import SeamRow
 from model_export.bench_service import LoadRow, RequestRow
-from model_export.served import serving
+from model_export.started_server import serving
 from service.inference.artifact import load_model_folder
 
 LARGE_ROUNDS = 3

@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from model_export.served import Server
+from model_export.started_server import Server
 from service import logs, server
 from service.app import create_app
 from service.config import load_settings

@@ -16,7 +16,7 @@ from httpx2 import Response
 from sqlalchemy import Connection, Engine, event, update
 from starlette.testclient import TestClient
 
-from model_export.served import serving
+from model_export.started_server import serving
 from service.access import is_public, needed_scope
 from service.app import create_app
 from service.config import Settings

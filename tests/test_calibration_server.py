@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 from httpx2 import Request
 
-from model_export.served import Reply, Server
-from model_export.served import serving as start
+from model_export.started_server import Reply, Server
+from model_export.started_server import serving as start
 from tests.fake_calibration import calibration_form
 from tests.held_server import GO, ended_calibration, folders, write_command
 from tests.inference.photographs import corners, png

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from model_export.served import serving
+from model_export.started_server import serving
 
 ROOT = Path(__file__).parents[1]
 SERVICE = (ROOT / "docker" / "service.Dockerfile").read_text()

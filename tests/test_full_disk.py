@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from model_export.served import CAMIND, Reply, Server, serving
+from model_export.started_server import CAMIND, Reply, Server, serving
 from tests.fake_calibration import calibration_form
 from tests.inference.photographs import corners, png
 

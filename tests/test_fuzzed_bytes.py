@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from model_export.served import Reply, Server, serving
+from model_export.started_server import Reply, Server, serving
 from tests.fuzzed_requests import Request, request
 
 ROUNDS, SOAK_ROUNDS = 300, 20_000

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from model_export.served import Reply, Server, serving
+from model_export.started_server import Reply, Server, serving
 from service.opencv import cv2
 from tests.fake_calibration import SETTINGS
 from tests.inference.photographs import corners, hostile_png, jpeg, png

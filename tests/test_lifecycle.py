@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from model_export.served import CAMIND, Reply, Server, serving
+from model_export.started_server import CAMIND, Reply, Server, serving
 from tests.storage.test_backup import damage, fill
 
 DRAIN_S = 2.0

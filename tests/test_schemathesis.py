@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from pydantic import TypeAdapter
 
-from model_export.served import Server, serving
+from model_export.started_server import Server, serving
 from service.calibration.report import Result
 from service.storage import schema
 from service.storage.calibrations import CalibrationDraft, Calibrations, Ending

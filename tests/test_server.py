@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from model_export.served import Server, serving
+from model_export.started_server import Server, serving
 
 RECEIVE_DEADLINE_S = 1.0
 

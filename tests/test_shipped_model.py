@@ -15,7 +15,7 @@ from model_export.cases import FIXED, fixed_cases, is_textured
 from model_export.config import SceneConfig
 from model_export.evaluate import Examiner
 from model_export.render import refocus
-from model_export.served import Server, serving
+from model_export.started_server import Server, serving
 from model_export.summary import summarise
 from model_export.textures import draw_texture
 from service.config import INT8, SHIPPED_MODEL

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from model_export.served import Server, serving
+from model_export.started_server import Server, serving
 from tests.inference.photographs import corners, png
 
 DEADLINE_S, SOAK_DEADLINE_S = 2.0, 60.0

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from model_export.served import Server, serving
+from model_export.started_server import Server, serving
 from tests.fake_calibration import calibration_form
 from tests.held_server import GO, write_command
 from tests.inference.photographs import corners, jpeg, png

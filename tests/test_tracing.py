@@ -15,7 +15,7 @@ from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTrace
 from opentelemetry.proto.common.v1.common_pb2 import KeyValue
 from opentelemetry.proto.trace.v1.trace_pb2 import Span, Status
 
-from model_export.served import serving
+from model_export.started_server import serving
 from service.api.depth import STAGES
 from tests.inference.photographs import corners, png
 

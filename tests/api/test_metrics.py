@@ -11,7 +11,7 @@ from fastapi import FastAPI
 from prometheus_client.parser import text_string_to_metric_families
 from starlette.testclient import TestClient
 
-from model_export.served import serving
+from model_export.started_server import serving
 from service import errors
 from service.app import create_app
 from service.config import Settings

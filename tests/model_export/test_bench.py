@@ -11,7 +11,7 @@ from model_export import bench_graphs, bench_seams, bench_service
 from model_export.bench_graphs import Timing, graph_flops, in_turns, machine_rates
 from model_export.bench_service import time_load
 from model_export.cli import commands
-from model_export.served import serving
+from model_export.started_server import serving
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from model_export.served import Server, serving
+from model_export.started_server import Server, serving
 from tests.web.chromium import running_browser
 from tests.web.watched import watched
 

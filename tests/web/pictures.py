@@ -10,7 +10,7 @@ from typing import Literal
 import cv2
 from playwright.sync_api import Browser, FilePayload, Page, expect
 
-from model_export.served import Server, serving
+from model_export.started_server import Server, serving
 from tests.simulated_sheets import CAMERA, DEPTHS_M, shots
 from tests.web.chromium import running_browser
 from tests.web.steps import to_photographs

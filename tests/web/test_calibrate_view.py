@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, Route, expect
 
-from model_export.served import Server, serving
+from model_export.started_server import Server, serving
 from tests.inference.photographs import tiff
 from tests.simulated_sheets import CAMERA, DEPTHS_M, GRID, shots
 from tests.web.steps import OVERFLOW, eventually, to_photographs

@@ -10,7 +10,7 @@ from uuid import uuid4
 import pytest
 from playwright.sync_api import Dialog, Page, Route, expect
 
-from model_export.served import Server
+from model_export.started_server import Server
 from service.optics.thin_lens import depth_at_focus
 from tests.web.steps import OVERFLOW, eventually
 

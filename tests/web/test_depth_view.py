@@ -19,7 +19,7 @@ import pytest
 from numpy.typing import NDArray
 from playwright.sync_api import Browser, Locator, Page, Position, Route, expect
 
-from model_export.served import Server, serving
+from model_export.started_server import Server, serving
 from service.inference.encode import UNDISTORTING
 from tests.inference import photographs
 from tests.web.chromium import program

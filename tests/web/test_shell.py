@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, FilePayload, Page, expect
 
-from model_export.served import Server, serving
+from model_export.started_server import Server, serving
 from service.config import DATABASE_FILE
 from service.principal import EVERYDAY, SCOPES, Scope
 from service.storage import schema
