@@ -271,8 +271,8 @@ def evaluate(
     with _training_parts():
         from model_export import report as reports
         from model_export.card import record_scores
-        from model_export.cases import SETS, trials
         from model_export.evaluate import evaluate as run_evaluation
+        from model_export.evaluation_sets import FOLDERS, evaluation_sets
 
     models = [model] if beside is None else [model, beside]
     with _plain_failures():
@@ -280,15 +280,15 @@ def evaluate(
             load_model_folder(folder)
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
-        sets = trials(data, quick)
-    if missing := [name for name in SETS if not any(trial.name.startswith(name) for trial in sets)]:
+        sets = evaluation_sets(data, quick)
+    if missing := [name for name in FOLDERS if not any(each.name.startswith(name) for each in sets)]:
         typer.secho(f"{data} has no pictures of {', '.join(missing)}: without them", err=True)
     with progress_bar(Console(stderr=True)) as progress, _plain_failures():
         task = progress.add_task("loading", total=len(sets))
         found = run_evaluation(
             models, sets, lambda said, finished: progress.update(task, description=said, advance=finished)
         )
-    if empty := {trial.name for trial in sets} - {found_of.name for found_of in found[0].sets}:
+    if empty := {each.name for each in sets} - {found_of.name for found_of in found[0].sets}:
         typer.secho(f"no picture with enough depth to score: without {', '.join(sorted(empty))}", err=True)
     tables = reports.tables(found[0])
     if beside is not None:
@@ -346,7 +346,7 @@ def calibration(
     from multiprocessing import get_context
 
     with _training_parts():
-        from model_export import bench_calibration as trials
+        from model_export import bench_calibration
         from model_export.devices import one_core
 
     stdout = Console()
@@ -354,16 +354,18 @@ def calibration(
         progress_bar(Console(stderr=True)) as progress,
         ProcessPoolExecutor(workers, get_context("forkserver"), initializer=one_core) as pool,
     ):
-        found = list(progress.track(pool.map(trials.random_camera, range(cameras)), cameras, description="cameras"))
+        found = list(
+            progress.track(pool.map(bench_calibration.random_camera, range(cameras)), cameras, description="cameras")
+        )
         if found:
-            stdout.print(trials.error_table(found))
+            stdout.print(bench_calibration.error_table(found))
         if pairs:
-            numbers = trials.PAPER_NUMBERS
-            results = pool.map(trials.paper_pairs, numbers, [pairs] * len(numbers))
-            table = Table(*trials.PAPER_HEAD, title=f"{pairs} pairs at half the focus distance")
+            numbers = bench_calibration.PAPER_NUMBERS
+            results = pool.map(bench_calibration.paper_pairs, numbers, [pairs] * len(numbers))
+            table = Table(*bench_calibration.PAPER_HEAD, title=f"{pairs} pairs at half the focus distance")
             for number, both in zip(numbers, progress.track(results, len(numbers), description="pairs"), strict=True):
                 for method, trial in both:
-                    table.add_row(*trials.paper_row(number, method, trial))
+                    table.add_row(*bench_calibration.paper_row(number, method, trial))
             stdout.print(table)
 
 

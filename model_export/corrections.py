@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from model_export.cases import PROCEDURAL_SIDES, Case, procedural_cases
 from model_export.evaluate import Examiner
+from model_export.evaluation_sets import PROCEDURAL_SIDES, Case, procedural_cases
 from model_export.summary import Pixels
 from service.inference.artifact import Manifest, load_model_folder, write_manifest
 
@@ -47,14 +47,14 @@ def record_corrections(model: Path, cases: Sequence[Case]) -> tuple[float, float
     """
     examiner = Examiner(model)
     seen = [examiner.answer(case)[0].blur for case in cases]
-    gain = _told(model, "blur_gain", blur_gain(Pixels.joined([blur for blur in seen if blur is not None])))
+    gain = _corrected(model, "blur_gain", blur_gain(Pixels.joined([blur for blur in seen if blur is not None])))
     examiner = Examiner(model)
-    told = [examiner.told(case, case.camera)[0].depth for case in cases if case.side != "auto"]
+    told = [examiner.answer_by(case.camera, case)[0].depth for case in cases if case.side != "auto"]
     found = temperature(Pixels.joined(told))
-    return gain, _told(model, "temperature", found)
+    return gain, _corrected(model, "temperature", found)
 
 
-def _told(model: Path, name: str, factor: float) -> float:
+def _corrected(model: Path, name: str, factor: float) -> float:
     """Multiply a number of a folder's manifest, which answers were made with, by what they lack; what it is now."""
     before = load_model_folder(model).manifest
     now = round(float(getattr(before, name)) * factor, DECIMALS)

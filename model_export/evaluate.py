@@ -4,7 +4,6 @@ Every picture goes through the estimator that answers requests, so a figure here
 without an answer is scored with the median of the picture's answers, and the share of answers is reported.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -16,10 +15,18 @@ from queue import Queue
 import numpy as np
 from numpy.typing import NDArray
 
-from model_export.calibrated import calibrated
-from model_export.cases import KNOWN_DEPTHS, UNSEEN_K_CAM_PX, Case, Trial
 from model_export.devices import one_core
+from model_export.evaluation_sets import Case, EvaluationSet
 from model_export.metrics import Scores, best_constant, completed, mean_scores, score
+from model_export.modes import (
+    KNOWN_DEPTHS,
+    MODES,
+    ORACLE_K_CAM,
+    RIGHT_SIDE,
+    TRUE_CAMERA,
+    UNSEEN_K_CAM_PX,
+    with_k_cam_times,
+)
 from model_export.summary import Example, Outcome, Pixels, Report, Sides, blur_ranges, summarise
 from service.cores import available_cores
 from service.inference.artifact import ModelFolder, load_model_folder
@@ -32,46 +39,6 @@ from service.inference.pair import GraphPair, RawMaps, Sights
 from service.optics import thin_lens
 from service.optics.camera import Camera
 
-# an unknown camera is taken for the middle one of those that are scored
-UNKNOWN_K_CAM_PX = math.prod(UNSEEN_K_CAM_PX) ** (1 / len(UNSEEN_K_CAM_PX))
-SENSOR_TIMES = 6  # as wide as the real lens' pictures
-
-
-def _misled(factor: float, camera: Camera) -> Camera:
-    """The camera with so many times its k_cam."""
-    return replace(camera, k_cam_px=factor * camera.k_cam_px)
-
-
-def _misfocused(factor: float, camera: Camera) -> Camera:
-    """The camera said to be focused so many times as far, its k_cam that of its lens there."""
-    return camera.focused_at(factor * camera.focus_distance_m)
-
-
-def _counted_from_lens(camera: Camera) -> Camera:
-    """The camera whose focus distance is a ring's, which counts it from the sensor."""
-    return camera.focused_at(thin_lens.focus_from_lens(camera.focus_distance_m, camera.focal_length_m or 0.0))
-
-
-def _registered_large(camera: Camera) -> Camera:
-    """The camera as registered with the size of its sensor, its pictures made a sixth as large by whatever program."""
-    width_px, height_px = camera.image_width_px, camera.image_height_px
-    large = camera.resized(SENSOR_TIMES * width_px, SENSOR_TIMES * height_px)
-    return replace(large, gamma_px=camera.gamma_px).resampled(width_px, height_px)
-
-
-MODES: dict[str, Callable[[Camera], Camera]] = {
-    "gt": lambda camera: camera,
-    "estimated k_cam": calibrated,
-    "no k_cam": lambda camera: replace(camera, k_cam_px=UNKNOWN_K_CAM_PX),
-    "k_cam -10%": partial(_misled, 0.9),
-    "k_cam +10%": partial(_misled, 1.1),
-    "focus -10%": partial(_misfocused, 0.9),
-    "focus +10%": partial(_misfocused, 1.1),
-    "ring from the sensor": _counted_from_lens,
-    "registered large": _registered_large,
-}
-# what no user has: they tell how much of an error is the camera's, and how much the side's
-RIGHT_SIDE, ORACLE_K_CAM = "right side", "oracle k_cam"
 CLEARLY_OUT = 0.25  # |x| from where on the side of focus is asked for
 SAMPLED_PIXELS = 3000
 
@@ -95,15 +62,16 @@ class Examiner:
         self._pair = _RememberingPair(folder, intra_op_threads=1)
         self._estimator = Estimator(self._pair)
 
-    def answer(self, case: Case, mode: str = "gt") -> tuple[Outcome, Example]:
+    def answer(self, case: Case, mode: str = TRUE_CAMERA) -> tuple[Outcome, Example]:
         """Run a case through the estimator, with the camera as the mode tells it, and score the answer."""
         if mode == RIGHT_SIDE:
             return self._scored(case, self._rightly_sided(case))
         known = case.known_depths if mode.endswith(KNOWN_DEPTHS) else ()
-        return self.told(case, MODES[mode.removesuffix(KNOWN_DEPTHS)](case.camera), known, blur=mode == "gt")
+        camera = MODES[mode.removesuffix(KNOWN_DEPTHS)](case.camera)
+        return self.answer_by(camera, case, known, blur=mode == TRUE_CAMERA)
 
-    def told(
-        self, case: Case, camera: Camera, known: Sequence[KnownDepth] = (), *, blur: bool = False
+    def answer_by(
+        self, camera: Camera, case: Case, known: Sequence[KnownDepth] = (), *, blur: bool = False
     ) -> tuple[Outcome, Example]:
         """Score the answer to a case that is said to be by some camera, and its lambda where asked to."""
         answered = self._estimator.estimate(case.image, camera, case.side, known=known)
@@ -179,23 +147,24 @@ def _sides(case: Case, told: DepthMap) -> Sides:
 
 @dataclass(slots=True)
 class _Examined:
-    """One model's outcomes of a trial by mode, and its first picture."""
+    """One model's outcomes of a set by mode, and its first picture."""
 
     name: str
     outcomes: dict[str, list[Outcome]] = field(default_factory=dict)
     searched: dict[float, list[Outcome]] = field(default_factory=dict)
     example: Example | None = None
 
-    def take(self, examiner: Examiner, case: Case, trial: Trial) -> None:
-        """Have the model answer one more picture, in all modes of the trial."""
-        for mode in trial.modes:
+    def take(self, examiner: Examiner, case: Case, scored_set: EvaluationSet) -> None:
+        """Have the model answer one more picture, in all modes of the set."""
+        for mode in scored_set.modes:
             outcome, example = examiner.answer(case, mode)
             self.outcomes.setdefault(mode, []).append(outcome)
             self.example = self.example or example
-        for factor in trial.factors:
-            is_known = factor == 1 and "gt" in trial.modes
-            told = self.outcomes["gt"][-1] if is_known else examiner.told(case, _misled(factor, case.camera))[0]
-            self.searched.setdefault(factor, []).append(told)
+        for factor in scored_set.factors:
+            is_known = factor == 1 and TRUE_CAMERA in scored_set.modes
+            camera = with_k_cam_times(factor, case.camera)
+            outcome = self.outcomes[TRUE_CAMERA][-1] if is_known else examiner.answer_by(camera, case)[0]
+            self.searched.setdefault(factor, []).append(outcome)
 
     def by_mode(self) -> dict[str, list[Outcome]]:
         """All outcomes, of the factors on k_cam the best one's."""
@@ -209,31 +178,31 @@ _Scored = dict[str, list[_Examined]]  # of each set, by model
 _examiner = cache(Examiner)  # each process that examines loads a model once
 
 
-def _examined(models: Sequence[Path], said: "Queue[tuple[str, int] | None]", job: Sequence[Trial]) -> _Scored:
+def _examined(models: Sequence[Path], said: "Queue[tuple[str, int] | None]", job: Sequence[EvaluationSet]) -> _Scored:
     examiners = [_examiner(model) for model in models]
     done: _Scored = {}
-    for trial in job:
-        found = done[trial.name] = [_Examined(trial.name) for _ in models]
-        for case in trial.cases():
+    for scored_set in job:
+        found = done[scored_set.name] = [_Examined(scored_set.name) for _ in models]
+        for case in scored_set.cases():
             for examiner, examined in zip(examiners, found, strict=True):
-                examined.take(examiner, case, trial)
-            said.put((f"{trial.name}: {case.name}", 0))
-        said.put((trial.name, 1))
+                examined.take(examiner, case, scored_set)
+            said.put((f"{scored_set.name}: {case.name}", 0))
+        said.put((scored_set.name, 1))
     return done
 
 
-def _jobs(trials: Sequence[Trial]) -> list[list[Trial]]:
+def _jobs(sets: Sequence[EvaluationSet]) -> list[list[EvaluationSet]]:
     """Sets that are scored one after the other, those of one camera known by its sheets together: sheets take long."""
-    jobs: dict[object, list[Trial]] = {}
+    jobs: dict[object, list[EvaluationSet]] = {}
     # what was named last first, whose pictures are large; then what is answered most often, lest a core wait in the end
-    for trial in reversed(trials):
-        jobs.setdefault(trial.sheets_of or trial.name, []).append(trial)
-    return sorted(jobs.values(), key=lambda job: -sum(trial.answers for trial in job))
+    for scored_set in reversed(sets):
+        jobs.setdefault(scored_set.sheets_of or scored_set.name, []).append(scored_set)
+    return sorted(jobs.values(), key=lambda job: -sum(scored_set.answers for scored_set in job))
 
 
 def evaluate(
     models: Sequence[Path],
-    trials: Sequence[Trial],
+    sets: Sequence[EvaluationSet],
     on_progress: Callable[[str, int], None] = lambda _said, _finished: None,
 ) -> list[Report]:
     """Score model folders on the same sets of pictures, a process on each core; a report of each.
@@ -255,12 +224,12 @@ def evaluate(
 
         listener.submit(listen)
         try:
-            parts = pool.map(partial(_examined, models, said), _jobs(trials))
+            parts = pool.map(partial(_examined, models, said), _jobs(sets))
             done = {name: found for part in parts for name, found in part.items()}
         finally:
             said.put(None)
-    by_model = zip(models, zip(*(done[trial.name] for trial in trials), strict=True), strict=True)
-    return [_reported(load_model_folder(model).manifest.name, sets) for model, sets in by_model]
+    by_model = zip(models, zip(*(done[scored_set.name] for scored_set in sets), strict=True), strict=True)
+    return [_reported(load_model_folder(model).manifest.name, scored) for model, scored in by_model]
 
 
 def _reported(model: str, done: Sequence[_Examined]) -> Report:

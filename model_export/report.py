@@ -13,9 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from model_export.cases import FIXED, UNSEEN_K_CAM_PX, VIEWS
 from model_export.datasets.photos import write_image
-from model_export.evaluate import MODES
+from model_export.evaluation_sets import FIXED, VIEWS
+from model_export.modes import MODES, TRUE_CAMERA, UNSEEN_K_CAM_PX
 from model_export.summary import EQUAL_BLUR_PX, EQUAL_DEFOCUS, KEPT_SHARES, BlurRange, Pixels, Report, Summary
 from service.inference.preview import render_preview
 
@@ -45,7 +45,7 @@ LEAST_IN_BIN = 50
 
 
 def _camera(s: Summary) -> list[str]:
-    return [s.name, "known" if s.mode == "gt" else s.mode]
+    return [s.name, "known" if s.mode == TRUE_CAMERA else s.mode]
 
 
 def _depth_row(s: Summary) -> list[str]:
@@ -85,8 +85,8 @@ def tables(report: Report) -> dict[str, Table]:
     """Title to head and rows, as text."""
     return {
         "Depth": (DEPTH_HEAD, [_depth_row(s) for s in report.sets]),
-        "Certainty": (CERTAINTY_HEAD, [_certainty_row(s) for s in report.sets if s.mode == "gt"]),
-        "AbsRel at equal blur and defocus": (EQUAL_HEAD, [_equal_row(s) for s in report.sets if s.mode == "gt"]),
+        "Certainty": (CERTAINTY_HEAD, [_certainty_row(s) for s in report.sets if s.mode == TRUE_CAMERA]),
+        "AbsRel at equal blur and defocus": (EQUAL_HEAD, [_equal_row(s) for s in report.sets if s.mode == TRUE_CAMERA]),
         "Depth differences within a picture": (RELIEF_HEAD, [row for s in report.sets for row in _relief_rows(s)]),
         "All scores of depth": (SCORES_HEAD, [row for s in report.sets for row in _score_rows(s)]),
         "Blur": (BLUR_HEAD, [_blur_row(b) for b in report.blur]),
@@ -97,7 +97,7 @@ def beside(report: Report, other: Report) -> Table:
     """How another model answers the same pictures by known cameras: head and rows, the last of the worst ratios."""
     rows, ratios = [], []
     for s in report.sets:
-        if s.mode == "gt":
+        if s.mode == TRUE_CAMERA:
             t = other.summary(s.name)
             pairs = (s.mean.abs_rel, t.mean.abs_rel), (s.pooled.rmse, t.pooled.rmse)
             ratios.append([its / own if own else math.nan for own, its in pairs])
@@ -190,7 +190,7 @@ def _of_depth(report: Report) -> list[Summary]:
     Frames and table tops are shown together, as indoor ones.
     """
     left_out = ("plane", FIXED, "rgbd", "tabletop")
-    return [s for s in report.sets if s.mode == "gt" and s.name.split()[0] not in left_out]
+    return [s for s in report.sets if s.mode == TRUE_CAMERA and s.name.split()[0] not in left_out]
 
 
 def _against_distance(axes: Axes, report: Report) -> None:
@@ -213,7 +213,9 @@ def _against_view(axes: Axes, report: Report) -> None:
     known = {(s.name, s.mode): s.mean.abs_rel for s in report.sets}
     for folder in ("rgbd", "tabletop"):
         names = {1.0: f"{folder} k_cam {UNSEEN_K_CAM_PX[1]:g}"} | {v: f"{folder} view {v:g}" for v in VIEWS}
-        points = sorted((view, known[name, "gt"]) for view, name in names.items() if (name, "gt") in known)
+        points = sorted(
+            (view, known[name, TRUE_CAMERA]) for view, name in names.items() if (name, TRUE_CAMERA) in known
+        )
         if points:
             axes.plot(*zip(*points, strict=True), marker="o", label=folder)
     axes.set(xlabel="field of view, as a part of the whole", ylabel="AbsRel", ylim=(0, None))
@@ -224,7 +226,7 @@ def _against_k_cam(axes: Axes, report: Report) -> None:
     for mode in MODES:
         points = [(k, known[n, mode]) for k in UNSEEN_K_CAM_PX if (n := f"indoor k_cam {k:g}", mode) in known]
         if points:
-            axes.plot(*zip(*points, strict=True), marker="o", label="known" if mode == "gt" else mode)
+            axes.plot(*zip(*points, strict=True), marker="o", label="known" if mode == TRUE_CAMERA else mode)
     axes.set(xlabel="k_cam, px", ylabel="pooled RMSE, m", ylim=(0, None))
 
 

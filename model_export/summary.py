@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_export.metrics import Scores, mean_scores, pooled_scores
+from model_export.modes import TRUE_CAMERA
 
 BLUR_RANGES_PX = (
     *((0.0, 0.5), (0.5, 1.0), (1.0, 2.0), (2.0, 4.0), (4.0, 8.0), (8.0, 16.0), (16.0, math.inf)),
@@ -215,7 +216,7 @@ class Report:
     blur_pixels: dict[str, Pixels]
     examples: dict[str, Example]
 
-    def summary(self, name: str, mode: str = "gt") -> Summary:
+    def summary(self, name: str, mode: str = TRUE_CAMERA) -> Summary:
         """Raises ``KeyError`` for a set that was not scored."""
         for found in self.sets:
             if (found.name, found.mode) == (name, mode):
@@ -230,7 +231,7 @@ class Report:
         """What the manifest keeps, by ``set.score``, in the mode where the camera is known."""
         kept: dict[str, float] = {}
         for s in self.sets:
-            if s.mode == "gt":
+            if s.mode == TRUE_CAMERA:
                 kept[f"{s.name}.abs_rel"] = s.mean.abs_rel
                 kept[f"{s.name}.constant_abs_rel"] = s.constant_mean.abs_rel
                 kept[f"{s.name}.rmse_m"] = s.pooled.rmse

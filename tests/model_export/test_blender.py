@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import pytest
 
-from model_export.cases import photographed_cases
 from model_export.datasets.blender import (
     EDGE_TOLERANCE,
     GAMMA_PX,
@@ -22,6 +21,7 @@ from model_export.datasets.blender import (
     shares,
     sharp_edge,
 )
+from model_export.evaluation_sets import photographed_cases
 from service.cores import available_cores
 from service.optics import thin_lens
 

@@ -10,9 +10,9 @@ import OpenEXR
 import pytest
 from typer.testing import CliRunner
 
-from model_export.cases import REFERENCE, photographed_cases, refocused_cases, trials
 from model_export.cli import commands
 from model_export.datasets.photos import Photo, load_photos, save_photos
+from model_export.evaluation_sets import REFERENCE, evaluation_sets, photographed_cases, refocused_cases
 from service.optics import thin_lens
 
 PICTURE = np.random.default_rng(1).integers(0, 256, (48, 64, 3), np.uint8)
@@ -36,7 +36,7 @@ def defocusnet(folder: Path) -> Path:
 def test_defocusnet_becomes_a_set_that_is_scored(tmp_path: Path) -> None:
     (tmp_path / "raw").mkdir()
     assert "5 pictures" in converted("defocusnet", defocusnet(tmp_path / "raw"), tmp_path / "data" / "defocusnet")
-    assert "defocusnet" in {trial.name for trial in trials(tmp_path / "data", quick=True)}
+    assert "defocusnet" in {each.name for each in evaluation_sets(tmp_path / "data", quick=True)}
     found = list(photographed_cases(tmp_path / "data" / "defocusnet", 5))
     assert [case.camera.focus_distance_m for case in found] == [0.1, 0.15, 0.3, 0.7, 1.5]
     first = found[0]
@@ -104,10 +104,10 @@ def test_own_photographs_are_scored_by_their_cameras(tmp_path: Path) -> None:
 def test_sharp_frames_under_a_name_of_their_own_are_refused_before_anything_is_scored(tmp_path: Path) -> None:
     save_photos(tmp_path / "nyu", [(Photo("a", PICTURE, np.ones((48, 64), np.float32)), {"fx_px": 518.9})])
     with pytest.raises(ValueError, match=f"no focus_distance_m of a.*scored in {tmp_path / 'rgbd'}"):
-        trials(tmp_path, quick=True)
+        evaluation_sets(tmp_path, quick=True)
 
 
 def test_a_set_is_not_named_as_one_that_is_drawn(tmp_path: Path) -> None:
     save_photos(tmp_path / "procedural near", [(Photo("a", PICTURE, np.ones((48, 64), np.float32)), {})])
     with pytest.raises(ValueError, match="name it otherwise"):
-        trials(tmp_path, quick=True)
+        evaluation_sets(tmp_path, quick=True)

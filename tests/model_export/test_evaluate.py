@@ -13,22 +13,22 @@ import pytest
 from typer.testing import CliRunner
 
 from model_export.calibrated import calibrated
-from model_export.cases import (
+from model_export.cli import commands
+from model_export.corrections import blur_gain, record_corrections, temperature, unseen_cases
+from model_export.evaluate import Examiner, evaluate
+from model_export.evaluation_sets import (
     ORACLE_FACTORS,
     REFERENCE,
-    UNSEEN_K_CAM_PX,
     Case,
-    Trial,
+    EvaluationSet,
     d200_cases,
+    evaluation_sets,
     procedural_cases,
     sharp_cases,
     shuffled_cases,
-    trials,
     viewed_cases,
 )
-from model_export.cli import commands
-from model_export.corrections import blur_gain, record_corrections, temperature, unseen_cases
-from model_export.evaluate import MODES, RIGHT_SIDE, Examiner, evaluate
+from model_export.modes import ESTIMATED_K_CAM, MODES, RIGHT_SIDE, UNSEEN_K_CAM_PX
 from model_export.report import beside, write
 from model_export.summary import EQUAL_BLUR_PX, Pixels, Relief, Report, Sides, blur_ranges, summarise
 from service.inference.artifact import Interval, load_model_folder, write_manifest
@@ -120,12 +120,12 @@ def test_what_a_user_knows_is_something_near_something_between_and_something_far
 
 
 def test_a_whole_evaluation_answers_by_cameras_known_by_their_sheets_too(data: Path) -> None:
-    modes = {trial.name: trial.modes for trial in trials(data, quick=False)}
-    assert all("estimated k_cam" in modes[f"rgbd k_cam {k_cam_px:g}"] for k_cam_px in UNSEEN_K_CAM_PX)
+    modes = {each.name: each.modes for each in evaluation_sets(data, quick=False)}
+    assert all(ESTIMATED_K_CAM in modes[f"rgbd k_cam {k_cam_px:g}"] for k_cam_px in UNSEEN_K_CAM_PX)
 
 
 def test_a_camera_known_by_its_sheets_alone_is_nearly_the_true_one() -> None:
-    found = MODES["estimated k_cam"](REFERENCE)
+    found = MODES[ESTIMATED_K_CAM](REFERENCE)
     assert 0 < abs(found.k_cam_px / REFERENCE.k_cam_px - 1) < 0.03
     assert found.focus_distance_m == pytest.approx(REFERENCE.focus_distance_m, rel=0.01)
     assert found.gamma_px == pytest.approx(REFERENCE.gamma_px, abs=0.03)
@@ -152,7 +152,7 @@ def test_the_right_side_is_that_of_each_pixel(oracle: Examiner) -> None:
 def test_the_oracle_finds_the_one_factor_that_all_pictures_like_best(tiny_model_dir: Path) -> None:
     wrong = replace(CAMERA, k_cam_px=CAMERA.k_cam_px / 1.25)
     pictures = [replace(case(1.0), camera=wrong) for _ in range(2)]
-    (report,) = evaluate([tiny_model_dir], [Trial("grey", partial(iter, pictures), factors=ORACLE_FACTORS)])
+    (report,) = evaluate([tiny_model_dir], [EvaluationSet("grey", partial(iter, pictures), factors=ORACLE_FACTORS)])
     assert report.summary("grey").mean.abs_rel > 0.05
     assert report.summary("grey", "oracle k_cam, x 1.25").mean.abs_rel == pytest.approx(0, abs=1e-3)
 
@@ -163,7 +163,7 @@ def test_two_models_are_compared_on_the_same_pictures(tiny_model_dir: Path, tmp_
     shutil.copytree(tiny_model_dir, other)
     write_manifest(other, load_model_folder(other).manifest.model_copy(update={"blur_gain": 0.9}))
     pictures = [case(0.8)]
-    both = evaluate([tiny_model_dir, other], [Trial("grey", partial(iter, pictures))])
+    both = evaluate([tiny_model_dir, other], [EvaluationSet("grey", partial(iter, pictures))])
     own, others = (report.summary("grey").mean.abs_rel for report in both)
     assert own == pytest.approx(0.25, abs=1e-3)
     assert others > own + 0.02
@@ -187,7 +187,7 @@ def _no_picture() -> Iterator[Case]:
 
 def test_a_picture_that_cannot_be_read_ends_the_evaluation_and_is_told_of(tiny_model_dir: Path) -> None:
     heard: list[tuple[str, int]] = []
-    sets = [Trial("grey", partial(iter, [case(1.0)])), Trial("missing", _no_picture)]
+    sets = [EvaluationSet("grey", partial(iter, [case(1.0)])), EvaluationSet("missing", _no_picture)]
     with pytest.raises(OSError, match="no such picture"):
         evaluate([tiny_model_dir], sets, lambda said, finished: heard.append((said, finished)))
     assert ("missing", 1) not in heard

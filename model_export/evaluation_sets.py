@@ -14,6 +14,18 @@ from numpy.typing import NDArray
 
 from model_export.config import SceneConfig
 from model_export.datasets.photos import CAMERAS, Photo, filled, load_photos
+from model_export.modes import (
+    ESTIMATED_K_CAM,
+    KNOWN_DEPTHS,
+    MISFOCUSED,
+    MISLED,
+    NO_K_CAM,
+    REGISTERED_LARGE,
+    RIGHT_SIDE,
+    RING_FROM_SENSOR,
+    TRUE_CAMERA,
+    UNSEEN_K_CAM_PX,
+)
 from model_export.pool import HELD_OUT_SEED
 from model_export.render import refocus
 from model_export.scenes import draw_sample, draw_shot, true_blur_px
@@ -23,7 +35,6 @@ from service.optics import thin_lens
 from service.optics.camera import Camera, Intrinsics, Lens
 
 FRAME_FX_PX = 525.0
-UNSEEN_K_CAM_PX = (2.64, 3.81, 6.80, 10.7)
 FAR_K_CAM_PX = (1.0, 20.0, 60.0)
 LARGE_K_CAMS_PX = {60.0: 4, 9.0: 3}  # such a k_cam belongs to a photograph of many pixels: so many times a frame's
 FOCUS_DISTANCES_M = (0.6, 1.0, 4.0)
@@ -41,18 +52,15 @@ CELL_CONTRAST = 0.03
 TEXTURED_SHARE = 0.6
 SIDES: dict[int, Side] = {-1: "near", 0: "auto", 1: "far"}
 FIXED = "fixed"
-SETS = ("rgbd", "tabletop", "d200", "blender")  # a folder of data each
+FOLDERS = ("rgbd", "tabletop", "d200", "blender")  # a set of each, or several
 FIXED_SCENES = 6
-TAKEN = (FIXED, "plane", "procedural", "indoor")  # what names of sets that are no folder begin with
+TAKEN_NAMES = (FIXED, "plane", "procedural", "indoor")  # what names of sets that are no folder begin with
 CAMERA_NAMES = ("focus_distance_m", "k_cam_px", "gamma_px")  # without which no picture can be answered
 ORACLE_FACTORS = (0.8, 0.9, 1.0, 1.1, 1.25, 1.4)
-MISFOCUSED = ("focus -10%", "focus +10%")
-KNOWN_DEPTHS = ", known depths"  # after the name of another mode: three depths of each picture are known besides
 KNOWN_RANKS = (1 / 6, 3 / 6, 5 / 6)
 PROCEDURAL_SIDES = {"near": -1, "far": 1, "mixed": 0}
 
 Map = NDArray[np.float32]
-
 
 REFERENCE = Camera(640, 480, 2.0, 3.81, 0.5, intrinsics=Intrinsics.centred(FRAME_FX_PX, 640, 480))
 
@@ -258,8 +266,8 @@ def _spread(folder: Path, count: int) -> Iterator[Photo]:
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
-    """A named set, and the modes (see ``evaluate.MODES``) in which its pictures are answered.
+class EvaluationSet:
+    """Pictures under one name, and the modes (see ``modes.MODES``) in which its pictures are answered.
 
     They are also answered with ``factors`` on all k_cam, of which the one that the truth likes best is kept.
     ``sheets_of`` is the camera that is known by photographs of a sheet in one of the modes.
@@ -267,7 +275,7 @@ class Trial:
 
     name: str
     cases: CaseSource
-    modes: tuple[str, ...] = ("gt",)
+    modes: tuple[str, ...] = (TRUE_CAMERA,)
     factors: tuple[float, ...] = ()
     sheets_of: Camera | None = None
 
@@ -282,29 +290,27 @@ def _enough(source: CaseSource) -> Iterator[Case]:
     return (case for case in source() if np.isfinite(case.truth_m).mean() > LEAST_SCORED)
 
 
-def trials(data: Path, quick: bool) -> list[Trial]:
+def evaluation_sets(data: Path, quick: bool) -> list[EvaluationSet]:
     """The sets that the data folder can serve; a folder that is missing, or has no pictures, is a missing set."""
     few, _, many, scenes = COUNTS[quick]
-    there = {name: data / name for name in SETS if any((data / name / "color").glob("*"))}
+    there = {name: data / name for name in FOLDERS if any((data / name / "color").glob("*"))}
     indoor = [there[name] for name in ("rgbd", "tabletop") if name in there]
     found = []
     if len(indoor) == 2:
-        found += [_trial(f"plane {depth_m:g} m", partial(plane_cases, data, depth_m, few)) for depth_m in PLANES_M]
-    found.append(_trial(FIXED, fixed_cases))
-    found += [
-        _trial(f"procedural {n}", partial(procedural_cases, scenes, side)) for n, side in PROCEDURAL_SIDES.items()
-    ]
+        found += [_set(f"plane {depth_m:g} m", partial(plane_cases, data, depth_m, few)) for depth_m in PLANES_M]
+    found.append(_set(FIXED, fixed_cases))
+    found += [_set(f"procedural {n}", partial(procedural_cases, scenes, side)) for n, side in PROCEDURAL_SIDES.items()]
     if "blender" in there:
-        found.append(_trial("blender", partial(photographed_cases, there["blender"], 2 * scenes), "right side"))
+        found.append(_set("blender", partial(photographed_cases, there["blender"], 2 * scenes), RIGHT_SIDE))
     for folder in photographed_folders(data):
-        found.append(_trial(folder.name, partial(photographed_cases, folder, 2 * scenes), "right side"))
+        found.append(_set(folder.name, partial(photographed_cases, folder, 2 * scenes), RIGHT_SIDE))
     for folder in indoor:
-        found += _indoor_trials(folder, quick)
+        found += _indoor_sets(folder, quick)
     if "d200" in there:
         source = partial(d200_cases, there["d200"], 2 * many)
-        told = ("ring from the sensor", "registered large", *MISFOCUSED)
-        further = ("right side", *told, "gt" + KNOWN_DEPTHS, MISFOCUSED[1] + KNOWN_DEPTHS)
-        found.append(replace(_trial("d200", source, *further), factors=ORACLE_FACTORS))
+        told = (RING_FROM_SENSOR, REGISTERED_LARGE, *MISFOCUSED)
+        further = (RIGHT_SIDE, *told, TRUE_CAMERA + KNOWN_DEPTHS, MISFOCUSED[1] + KNOWN_DEPTHS)
+        found.append(replace(_set("d200", source, *further), factors=ORACLE_FACTORS))
     return found
 
 
@@ -313,19 +319,19 @@ def photographed_folders(data: Path) -> list[Path]:
 
     Raises ``ValueError`` for the name of another set, or a picture whose camera is not told.
     """
-    folders = sorted(file.parent for file in data.glob(f"*/{CAMERAS}") if file.parent.name not in SETS)
-    if taken := [folder for folder in folders if folder.name in TAKEN or " " in folder.name]:
+    folders = sorted(file.parent for file in data.glob(f"*/{CAMERAS}") if file.parent.name not in FOLDERS)
+    if taken := [folder for folder in folders if folder.name in TAKEN_NAMES or " " in folder.name]:
         raise ValueError(f"{taken[0]} has the name of another set, or a space in it: name it otherwise")
     for folder in folders:
         _cameras(folder)
     return folders
 
 
-def _trial(name: str, source: CaseSource, *further_modes: str) -> Trial:
-    return Trial(name, partial(_enough, source), ("gt", *further_modes))
+def _set(name: str, source: CaseSource, *further_modes: str) -> EvaluationSet:
+    return EvaluationSet(name, partial(_enough, source), (TRUE_CAMERA, *further_modes))
 
 
-def _indoor_trials(folder: Path, quick: bool) -> list[Trial]:
+def _indoor_sets(folder: Path, quick: bool) -> list[EvaluationSet]:
     """Sharp frames refocused by several cameras, at other distances of focus and in other fields of view."""
     few, several, many, _ = COUNTS[quick]
 
@@ -336,25 +342,25 @@ def _indoor_trials(folder: Path, quick: bool) -> list[Trial]:
     found = []
     for k_cam_px in (REFERENCE.k_cam_px,) if quick else UNSEEN_K_CAM_PX:
         camera = replace(REFERENCE, k_cam_px=k_cam_px)
-        misled = ("k_cam -10%", "k_cam +10%", *misfocused) if camera == REFERENCE else ()
+        misled = (*MISLED, *misfocused) if camera == REFERENCE else ()
         # a camera's sheets take as long to photograph as everything else of a set
-        further = ("no k_cam", *misled) if quick else ("estimated k_cam", "no k_cam", *misled)
+        further = (NO_K_CAM, *misled) if quick else (ESTIMATED_K_CAM, NO_K_CAM, *misled)
         count = many if camera == REFERENCE else several
-        trial = _trial(f"{folder.name} k_cam {k_cam_px:g}", by(camera, count), *further)
-        found.append(replace(trial, sheets_of=None if quick else camera))
-    found.append(_trial(f"{folder.name} in focus", partial(sharp_cases, folder, few)))
-    found.append(_trial(f"{folder.name} shuffled", partial(shuffled_cases, folder, few)))
+        own = _set(f"{folder.name} k_cam {k_cam_px:g}", by(camera, count), *further)
+        found.append(replace(own, sheets_of=None if quick else camera))
+    found.append(_set(f"{folder.name} in focus", partial(sharp_cases, folder, few)))
+    found.append(_set(f"{folder.name} shuffled", partial(shuffled_cases, folder, few)))
     for view in VIEWS:
-        found += [_trial(f"{folder.name} view {view:g}", partial(viewed_cases, folder, several, view))]
+        found += [_set(f"{folder.name} view {view:g}", partial(viewed_cases, folder, several, view))]
     if quick:
         return found
     for k_cam_px in FAR_K_CAM_PX:
-        found += [_trial(f"{folder.name} k_cam {k_cam_px:g}", by(replace(REFERENCE, k_cam_px=k_cam_px), few))]
+        found += [_set(f"{folder.name} k_cam {k_cam_px:g}", by(replace(REFERENCE, k_cam_px=k_cam_px), few))]
     for k_cam_px, times in LARGE_K_CAMS_PX.items():
         enlarged = partial(enlarged_cases, folder, few, replace(REFERENCE, k_cam_px=k_cam_px / times), times)
         large = f"{REFERENCE.image_width_px * times}x{REFERENCE.image_height_px * times}"
-        found += [_trial(f"{folder.name} k_cam {k_cam_px:g} of {large}", enlarged)]
+        found += [_set(f"{folder.name} k_cam {k_cam_px:g} of {large}", enlarged)]
     for focus_m in FOCUS_DISTANCES_M:
         camera = replace(REFERENCE, focus_distance_m=focus_m)
-        found.append(_trial(f"{folder.name} focus {focus_m:g} m", by(camera, few, "auto"), *misfocused))
+        found.append(_set(f"{folder.name} focus {focus_m:g} m", by(camera, few, "auto"), *misfocused))
     return found
