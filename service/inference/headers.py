@@ -26,7 +26,8 @@ ICC_SIGNATURE, ICC_NUMBERING = b"ICC_PROFILE\x00", 2
 HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"mif1"})
 JPEG_MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
 JPEG_FILL = re.compile(rb"\xff*(?=\xff)")
-JPEG_END, JPEG_SCAN, JPEG_APP1, JPEG_APP2 = 0xD9, 0xDA, 0xE1, 0xE2
+JPEG_END, JPEG_SCAN, JPEG_STEPS, JPEG_APP1, JPEG_APP2 = 0xD9, 0xDA, 0xDB, 0xE1, 0xE2
+JPEG_STEPS_OF_50 = 3688  # all 64 of luminance together, where quality is 50 (ITU-T T.81, annex K)
 JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 JPEG_BARE = frozenset({0x01, 0xD8, *range(0xD0, 0xD8)})
 TIFF_WIDTH, TIFF_HEIGHT, TIFF_BITS, TIFF_ORIENTATION, TIFF_SAMPLE_FORMAT = 256, 257, 258, 274, 339
@@ -59,7 +60,7 @@ class Header:
     """Stored size in pixels, before orientation (EXIF, 1..8) is applied; ``exif`` is the EXIF, without a signature.
 
     Of a tiff or raw file that is the file. ``has_more``: other pages or frames follow. ``curve``: what its values have,
-    by H.273's number.
+    by H.273's number. ``quality``: of a jpeg, 1 to 100, as most programs count it.
     """
 
     kind: Kind
@@ -70,6 +71,7 @@ class Header:
     exif: bytes = b""
     has_more: bool = False
     curve: int = SRGB
+    quality: float | None = None
 
     @property
     def other_curve(self) -> str | None:
@@ -122,6 +124,7 @@ def _too_many_parts(kind: str) -> InvalidImage:
 def _jpeg(data: bytes) -> Header:
     size: tuple[int, int] | None = None
     exif = profile = b""
+    quality: float | None = None
     scans = 0
     for marker, payload in _jpeg_segments(data):
         scans += marker == JPEG_SCAN
@@ -134,9 +137,19 @@ def _jpeg(data: bytes) -> Header:
             exif = payload[len(EXIF_SIGNATURE) :]
         elif marker == JPEG_APP2 and payload.startswith(ICC_SIGNATURE):
             profile = profile or payload[len(ICC_SIGNATURE) + ICC_NUMBERING :]
+        elif marker == JPEG_STEPS and quality is None:
+            quality = _jpeg_quality(payload)
     if size is None:
         raise InvalidImage("The jpeg file holds no picture.")
-    return Header("jpeg", *size, _exif_orientation(exif), exif=exif, curve=curve_of_profile(profile))
+    curve = curve_of_profile(profile)
+    return Header("jpeg", *size, _exif_orientation(exif), exif=exif, curve=curve, quality=quality)
+
+
+def _jpeg_quality(tables: bytes) -> float:
+    """libjpeg's quality whose steps are as coarse in all as those of the first table, luminance's."""
+    steps = struct.unpack_from(">64H" if tables[0] >> 4 else ">64B", tables, 1)
+    coarseness = sum(steps) / JPEG_STEPS_OF_50
+    return 50 / coarseness if coarseness > 1 else 100 - 50 * coarseness
 
 
 def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:

@@ -59,6 +59,7 @@ UNTURNS = {orientation: {6: 8, 8: 6}.get(orientation, orientation) for orientati
 DECODE_FLAGS = cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 # an industrial camera's 12 bits, in a file of 16 as they are
 MOST_OF_12_BITS, MOST_OF_16_BITS = 4095, 65535
+LEAST_QUALITY = 60  # of a jpeg, that the model was trained on
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +115,9 @@ def read_photograph(data: bytes, media_type: str | None = None, limits: ImageLim
         warnings += ("the file has more than one picture: the first was read",)
     if header.other_curve is not None:
         warnings += (f"its colour profile is {header.other_curve}, and it was read as sRGB: export it as sRGB",)
+    if header.quality is not None and round(header.quality) < LEAST_QUALITY:
+        said = f"a jpeg of quality {header.quality:.0f}, below the {LEAST_QUALITY} that the model was trained on"
+        warnings += (f"{said}: send what the camera stored",)
     return Photograph(turned(stored, orientation), kind, orientation, warnings, read_exif(header.exif))
 
 

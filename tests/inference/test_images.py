@@ -158,6 +158,23 @@ def test_a_damaged_png_is_refused() -> None:
         read_photograph(bytes(data))
 
 
+@pytest.mark.parametrize(("quality", "is_told"), [(98, False), (60, False), (59, True), (50, True), (30, True)])
+def test_a_jpeg_coarser_than_the_model_learned_of_is_told(quality: int, *, is_told: bool) -> None:
+    data = jpeg(corners(), quality=quality)
+    assert read_header(data).quality == pytest.approx(quality, abs=0.3)
+    told = [words for words in read_photograph(data).warnings if f"a jpeg of quality {quality}, below the 60" in words]
+    assert len(told) == is_told
+    assert len(read_photograph(data).warnings) == is_told
+
+
+def test_the_quality_of_a_jpeg_with_steps_of_16_bits_is_that_of_its_luminance() -> None:
+    data = jpeg(corners(), quality=40)
+    at = data.index(b"\xff\xdb")
+    steps = data[at + 5 : at + 69]
+    wide = b"\xff\xdb" + struct.pack(">HB64H", 131, 0x10, *steps)
+    assert read_header(data[:at] + wide + data[at:]).quality == pytest.approx(40, abs=0.3)
+
+
 def test_what_stands_behind_the_end_of_a_jpeg_does_no_harm() -> None:
     assert read_photograph(jpeg(corners()) + b"a maker's trailer").rgb.shape == (48, 64, 3)
 
