@@ -76,8 +76,14 @@ def draft_camera(exif: Exif, width_px: int, height_px: int) -> Draft:
 
 
 def _focus_m(exif: Exif, warnings: list[str]) -> float | None:
-    distance_m = exif.subject_distance_m
-    if distance_m is None or not FOCUS_DISTANCES_M[0] <= distance_m <= FOCUS_DISTANCES_M[1]:
+    distance_m, farthest_m = exif.subject_distance_m, FOCUS_DISTANCES_M[1]
+    if distance_m == math.inf:
+        warnings.append(
+            f"focused at infinity as the camera reports it, for which {farthest_m:g} m stand: better measure from the "
+            "lens to what is sharpest"
+        )
+        return farthest_m
+    if distance_m is None or not FOCUS_DISTANCES_M[0] <= distance_m <= farthest_m:
         warnings.append("its EXIF does not say where the lens was focused: focus_distance_m is needed")
         return None
     warnings.append(

@@ -22,7 +22,10 @@ RENDERINGS = {6: "a panorama", 7: "a portrait mode", 8: "a portrait mode"}
 
 @dataclass(frozen=True, slots=True)
 class Exif:
-    """The tags that make a camera, and what it did; None where a tag is missing, empty or no positive number."""
+    """The tags that make a camera, and what it did; None where a tag is missing, empty or no positive number.
+
+    ``subject_distance_m`` alone may be infinite.
+    """
 
     make: str | None = None
     model: str | None = None
@@ -74,7 +77,7 @@ def _with_shot(body: Exif, shot: TiffDirectory) -> Exif:
         focal_length_mm=shot.number(FOCAL_LENGTH),
         focal_length_35mm=shot.number(FOCAL_LENGTH_35MM),
         f_number=shot.number(F_NUMBER),
-        subject_distance_m=shot.number(SUBJECT_DISTANCE),
+        subject_distance_m=shot.number(SUBJECT_DISTANCE, math.inf),
         digital_zoom=shot.number(DIGITAL_ZOOM),
         width_px=int(width) if width else None,
         height_px=int(height) if height else None,

@@ -11,6 +11,7 @@ from service.optics.camera import Camera, Lens
 
 LENS_TOLERANCE = 0.05
 FOCUS_TOLERANCE = 0.15
+AS_INFINITY_M = 50.0  # from where on no ring has a figure but that of infinity
 VIEW_TOLERANCE = 1.05
 SAME_VIEW = 1.25  # equivalents are rounded, and count the whole of a sensor that 16:9 or a square is cut out of
 
@@ -81,11 +82,15 @@ def _other_lens(exif: Exif, lens: Lens) -> Iterator[str]:
 
 
 def _other_focus(exif: Exif, focus_distance_m: float) -> Iterator[str]:
-    """What cameras note is coarse, and counts from the sensor in most."""
-    noted = [each for each in (exif.subject_distance_m, exif.focus_from_lens_m) if each is not None]
-    if noted and all(abs(each / focus_distance_m - 1) > FOCUS_TOLERANCE for each in noted):
+    """What cameras note is coarse, and counts from the sensor in most, at 1:1 a few focal lengths more."""
+    noted_m = exif.subject_distance_m
+    if noted_m is None or (noted_m == math.inf and focus_distance_m >= AS_INFINITY_M):
+        return
+    nearest_m = exif.focus_from_lens_m or min(noted_m, (exif.focal_length_mm or math.inf) / 1e3)
+    if not nearest_m / (1 + FOCUS_TOLERANCE) <= focus_distance_m <= noted_m / (1 - FOCUS_TOLERANCE):
+        noted = "infinity" if noted_m == math.inf else f"{noted_m:.4g} m"
         yield (
-            f"its EXIF says that it was focused at {noted[0]:.4g} m, the camera at {focus_distance_m:.4g} m: "
+            f"its EXIF says that it was focused at {noted}, the camera at {focus_distance_m:.4g} m: "
             "send this shot's focus_distance_m"
         )
 

@@ -421,8 +421,8 @@ class TiffDirectory:
         at = self.offset_of(tag)
         return b"" if at is None else self._data[at : at + self._unpack("I", self._entries[tag] + 4)[0]]
 
-    def number(self, tag: int) -> float | None:
-        """A tag's first number, of any type; None without one that is positive and finite (all ones are infinity)."""
+    def number(self, tag: int, infinity: float | None = None) -> float | None:
+        """A tag's first number, of any type; None without one that is positive and finite (all ones: ``infinity``)."""
         at = self.offset_of(tag)
         if at is None:
             return None
@@ -431,7 +431,7 @@ class TiffDirectory:
             return None
         over, *under = self._unpack(TIFF_NUMBERS[kind], at)
         if over == INFINITY:
-            return None
+            return infinity
         value = over / (under[0] or math.nan) if under else over
         return value if 0 < value < math.inf else None
 

@@ -1,5 +1,6 @@
 """A camera drafted from EXIF: the real focal length or none, and never a number nobody vouches for."""
 
+import math
 import random
 import re
 import struct
@@ -82,7 +83,8 @@ def test_without_exif_there_are_no_tags(data: bytes) -> None:
 def test_a_number_that_means_unknown_is_none(value: tuple[int, int]) -> None:
     shot = {F_NUMBER: value, SUBJECT: value, FOCAL: value, PLANE_RESOLUTION: value}
     found = read_exif(exif_of({}, shot))
-    assert (found.f_number, found.subject_distance_m, found.focal_length_mm) == (None, None, None)
+    assert (found.f_number, found.focal_length_mm, found.focal_plane_pitch_um) == (None, None, None)
+    assert found.subject_distance_m == (math.inf if value[0] == 2**32 - 1 else None)
 
 
 def test_a_list_of_cameras_knows_the_sensor() -> None:
@@ -195,6 +197,10 @@ def test_where_it_was_focused_is_taken_with_care() -> None:
     assert drafted.focus_distance_m == 1.5
     assert said(drafted, "1.5 m", "coarse")
     assert draft(subject_distance_m=1e9).focus_distance_m is None
+    infinite = draft(subject_distance_m=math.inf)
+    assert infinite.focus_distance_m == 100_000
+    assert said(infinite, "focused at infinity", "100000 m stand")
+    assert not said(infinite, "is needed")
 
 
 def test_a_ring_counts_from_the_sensor_and_the_draft_says_what_that_is_from_the_lens() -> None:

@@ -1,5 +1,6 @@
 """The camera follows its photograph: turned, resized, or refused."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -149,6 +150,7 @@ def test_a_portrait_mode_is_told_of() -> None:
         (None, 35.0, False),
         (0.6, 100.0, True),
         (2.35, 100.0, False),  # 2.24 m from the lens
+        (math.inf, 35.0, True),
     ],
 )
 def test_another_focus_than_the_camera_s_is_told_of_unless_it_came_with_the_photograph(
@@ -157,8 +159,26 @@ def test_another_focus_than_the_camera_s_is_told_of_unless_it_came_with_the_phot
     exif = Exif(focal_length_mm=focal_length_mm, subject_distance_m=noted_m)
     said = [*taken_otherwise(exif, None, 2.0)]
     assert len(said) == is_other
-    assert all(f"focused at {noted_m:g} m, the camera at 2 m" in words for words in said)
+    noted = "infinity" if noted_m == math.inf else f"{noted_m} m"
+    assert all(f"focused at {noted}, the camera at 2 m" in words for words in said)
     assert not [*taken_otherwise(exif, None, None)]
+
+
+def test_infinity_agrees_with_any_focus_that_no_ring_has_a_figure_for() -> None:
+    infinite = Exif(focal_length_mm=50.0, subject_distance_m=math.inf)
+    for focus_m, is_other in ((30.0, True), (50.0, False), (1e5, False)):
+        assert len([*taken_otherwise(infinite, None, focus_m)]) == is_other
+
+
+@pytest.mark.parametrize(
+    ("noted_m", "from_lens_m", "is_other"),
+    [(0.31, 0.2, False), (0.31, 0.15, False), (0.31, 0.4, True), (0.5, 0.42, False), (0.5, 0.3, True)],
+)
+def test_a_macro_lens_may_be_as_much_nearer_than_its_sensor_as_it_is_long(
+    noted_m: float, from_lens_m: float, *, is_other: bool
+) -> None:
+    macro = Exif(focal_length_mm=105.0, subject_distance_m=noted_m)
+    assert len([*taken_otherwise(macro, None, from_lens_m)]) == is_other
 
 
 @pytest.mark.parametrize(
