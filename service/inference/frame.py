@@ -12,6 +12,8 @@ from service.optics.camera import Camera, Lens
 LENS_TOLERANCE = 0.05
 FOCUS_TOLERANCE = 0.15
 AS_INFINITY_M = 50.0  # from where on no ring has a figure but that of infinity
+INFINITY_M = 100_000.0  # the farthest that can be told
+SENSOR_WIDTHS_MM = (0.5, 100.0)  # an endoscope's, and more than a digital back's
 VIEW_TOLERANCE = 1.05
 SAME_VIEW = 1.25  # equivalents are rounded, and count the whole of a sensor that 16:9 or a square is cut out of
 
@@ -32,6 +34,7 @@ def camera_of(photograph: Photograph, camera: Camera) -> tuple[Camera, tuple[str
     A camera is registered with the size of its files or with that of its upright pictures. Raises
     ``ImageSizeMismatch`` for a picture that is not the whole frame.
     """
+    unlikely = tuple(_no_ring_s_figure(camera.focus_distance_m))
     width_px, height_px = photograph.width_px, photograph.height_px
     turned = camera.turned(*TURNS[photograph.orientation])
     fitting = next((one for one in (turned, camera) if one.is_same_frame(width_px, height_px)), None)
@@ -48,17 +51,28 @@ def camera_of(photograph: Photograph, camera: Camera) -> tuple[Camera, tuple[str
         )
     resized = fitting.resampled(width_px, height_px)
     if resized is fitting:
-        return fitting, ()
+        return fitting, unlikely
     warning = (
         f"the photograph has {width_px}x{height_px} pixels and the camera "
         f"{fitting.image_width_px}x{fitting.image_height_px}: "
         f"k_cam_px {resized.k_cam_px:.4g} and gamma_px {resized.gamma_px:.4g} were scaled to it"
     )
-    return resized, (warning,)
+    return resized, (*unlikely, warning)
+
+
+def _no_ring_s_figure(focus_distance_m: float) -> Iterator[str]:
+    """A warning of a distance that is as good as infinity, and may be one in millimetres or centimetres."""
+    if AS_INFINITY_M <= focus_distance_m < INFINITY_M:
+        yield (
+            f"focused at {focus_distance_m:.6g} m, which is all but infinity: it counts in metres, and {INFINITY_M:g} "
+            "stands for infinity"
+        )
 
 
 def taken_otherwise(exif: Exif, lens: Lens | None, focus_distance_m: float | None) -> Iterator[str]:
     """Warnings where a photograph was zoomed, rendered, or not taken with the lens or the focus that were told.
+
+    Also where what was told of the lens makes no sensor.
 
     ``focus_distance_m`` is the camera's where the photograph came without one of its own.
     """
@@ -69,6 +83,7 @@ def taken_otherwise(exif: Exif, lens: Lens | None, focus_distance_m: float | Non
         yield f"its EXIF says {exif.rendering}: its blur may be computed, and no lens'"
     if lens is not None:
         yield from _other_lens(exif, lens)
+        yield from _impossible_sensor(lens)
     if focus_distance_m is not None:
         yield from _other_focus(exif, focus_distance_m)
 
@@ -79,6 +94,14 @@ def _other_lens(exif: Exif, lens: Lens) -> Iterator[str]:
     if any(abs(theirs / ours - 1) > LENS_TOLERANCE for theirs, ours, _ in known):
         says = " ".join(form.format(round(theirs, 2)) for theirs, _, form in known)
         yield f"its EXIF says {says}, the camera is {lens.focal_length_mm:g} mm f/{lens.f_number:g}"
+
+
+def _impossible_sensor(lens: Lens) -> Iterator[str]:
+    if not SENSOR_WIDTHS_MM[0] <= lens.sensor_width_mm <= SENSOR_WIDTHS_MM[1]:
+        yield (
+            f"lens.pixel_pitch_um times lens.sensor_width_px is a sensor {lens.sensor_width_mm:.3g} mm wide, which "
+            "hardly can be: k_cam and metres are wrong if it is not"
+        )
 
 
 def _other_focus(exif: Exif, focus_distance_m: float) -> Iterator[str]:

@@ -25,6 +25,11 @@ class Lens:
     def focal_length_m(self) -> float:
         return self.focal_length_mm * 1e-3
 
+    @property
+    def sensor_width_mm(self) -> float:
+        """Of what the pictures show of the sensor."""
+        return self.pixel_pitch_um * 1e-3 * self.sensor_width_px
+
     def k_cam_px(self, focus_distance_m: float, image_width_px: int) -> float:
         """k_cam at the given focus distance and image width; ``ValueError`` if f >= s1."""
         return thin_lens.k_cam(

@@ -201,3 +201,28 @@ def test_a_focal_length_that_close_focus_makes_longer_is_told_of(
 def test_another_frame_is_refused_with_both_sizes(width: int, height: int, advice: str) -> None:
     with pytest.raises(ImageSizeMismatch, match=rf"{width}x{height}.*640x480.*{advice}"):
         camera_of(photograph(width, height), CAMERA)
+
+
+@pytest.mark.parametrize(
+    ("focus_m", "is_told"), [(2.0, False), (30.0, False), (130.0, True), (1300.0, True), (1e5, False)]
+)
+def test_a_focus_distance_that_may_be_in_millimetres_is_told(focus_m: float, *, is_told: bool) -> None:
+    _, warnings = camera_of(photograph(640, 480), CAMERA.focused_at(focus_m))
+    assert [f"focused at {focus_m:g} m" in words for words in warnings] == [True] * is_told
+
+
+@pytest.mark.parametrize(
+    ("pitch_um", "width_px", "is_told"),
+    [
+        (6.0, 6000, False),
+        (5.3, 8256, False),
+        (1.0, 600, False),
+        (6.0, 36, True),
+        (6.0, 36_000, True),
+        (0.06, 6000, True),
+    ],
+    ids=["full frame", "medium format", "endoscope", "width in mm", "width in um", "pitch of another unit"],
+)
+def test_specs_that_make_no_sensor_are_told(pitch_um: float, width_px: int, *, is_told: bool) -> None:
+    said = [*taken_otherwise(Exif(), Lens(35.0, 1.4, pitch_um, width_px), 2.0)]
+    assert ["which hardly can be" in words for words in said] == [True] * is_told
