@@ -27,6 +27,7 @@ from service.optics.focus import Sighting, fit_focus
 MOST_DEVIATIONS = 3.0
 # chosen on the development sets, three known depths a picture (docs/training.md)
 SURELY_OUT = 0.15  # x from where on a known depth tells its side
+SURE_SIDE = 0.95  # of a right tape's depths that tell their side, a picture is as sure of the other one in 1 of 51
 SHARED_ODDS = 2.0  # standard deviation, over pictures, of what all of a picture's log odds of the side are off by
 OWN_ODDS = 3.0
 REACH = 0.1  # of the longer side: standard deviation of what is near by
@@ -100,6 +101,12 @@ class Clues:
             f"its blur speaks against the known depth of {point.depth_m:g} m at {point.u:g},{point.v:g}"
             for point, deviations in zip(known, fit.deviations, strict=True)
             if deviations > MOST_DEVIATIONS
+        )
+        told += (
+            f"{point.u:g},{point.v:g} looks surely {'nearer than' if near > SURE_SIDE else 'beyond'} what is in focus, "
+            f"where the known depth of {point.depth_m:g} m is not: by that it is answered"
+            for point, near, leaning in zip(known, p_near, leanings, strict=True)
+            if (leaning == 1 and near < 1 - SURE_SIDE) or (leaning == -1 and near > SURE_SIDE)
         )
         return cls(
             fitted,

@@ -155,7 +155,16 @@ def test_a_known_side_holds_where_the_model_is_sure_of_the_other(estimator: Esti
     answer = estimator.estimate(photograph(red=1), TOLD, known=KNOWN)
     assert answer.depth_m[120, 60] == pytest.approx(LEFT_M, rel=0.03)
     assert answer.p_near[120, 60] > 0.9
-    assert len(answer.warnings) == 1
+
+
+@pytest.mark.parametrize(
+    ("red", "told"), [(1, "60,120 looks surely beyond"), (254, "330,40 looks surely nearer than"), (EVENLY, "")]
+)
+def test_a_known_depth_on_the_side_where_the_photograph_surely_is_not_is_told_of(
+    estimator: Estimator, red: int, told: str
+) -> None:
+    answer = estimator.estimate(photograph(red), TOLD, known=KNOWN)
+    assert [told in warning for warning in answer.warnings if "looks surely" in warning] == [True] * bool(told)
 
 
 def test_two_depths_of_one_pixel_are_an_error_of_that_much_and_told_of(estimator: Estimator) -> None:
