@@ -139,7 +139,7 @@ export function CamerasView({ shown, cameras, lacksCameras, camera, reloadCamera
 				</section>
 				<div class="stack">
 					${open.kind === "none" &&
-					(cameras?.length ?? 0) > 0 &&
+					!!cameras?.length &&
 					html`<p class="hint">Choose a camera to see what it can measure.</p>`}
 					${(open.kind === "new" || open.kind === "edit") &&
 					html`<${CameraForm}

@@ -2,7 +2,8 @@
 
 import { short } from "./numbers.js";
 import { logTicks, ticksOf } from "./ticks.js";
-import { html, useEffect, useRef, useState } from "./vendor/preact.js";
+import { html } from "./vendor/preact.js";
+import { useWidth } from "./width.js";
 
 const HEIGHT = 280;
 const LEFT = 64;
@@ -27,7 +28,7 @@ const MOST_ROWS = 30;
 
 /** @param {{title: string, x: Axis, y: Axis, series: Series[], marks?: {x: number, label: string}[]}} props `marks` are upright lines with a word */
 export function Chart({ title, x, y, series, marks = [] }) {
-	const [box, width] = useWidth();
+	const [box, width] = useWidth(480);
 	const points = series.flatMap((one) => one.points);
 	if (points.length === 0) return null;
 	const across = scaleOf(x, [...points.map((point) => point.x), ...marks.map((mark) => mark.x)], LEFT, width - RIGHT);
@@ -81,21 +82,6 @@ export function Chart({ title, x, y, series, marks = [] }) {
 			</details>
 		</figure>
 	`;
-}
-
-/** @returns {[import("preact").RefObject<HTMLElement>, number]} an element to watch, and its width */
-function useWidth() {
-	const box = useRef(/** @type {HTMLElement | null} */ (null));
-	const [width, setWidth] = useState(480);
-	useEffect(() => {
-		if (box.current === null) return undefined;
-		const observer = new ResizeObserver(([entry]) => {
-			if (entry.contentRect.width > 0) setWidth(Math.round(entry.contentRect.width));
-		});
-		observer.observe(box.current);
-		return () => observer.disconnect();
-	}, []);
-	return [box, width];
 }
 
 /** @param {Axis} axis @param {number[]} values @param {number} start where the least value stands @param {number} end @returns {Scale} */

@@ -37,7 +37,7 @@ import { html, useCallback, useEffect, useMemo, useRef, useState } from "./vendo
  * @property {string} model
  */
 
-/** @typedef {{distanceM: number, sigmaM: number} | "unknown"} Measured */
+/** @typedef {{distanceM: number, sigmaM: number} | false} Measured false where it is not known */
 /** @typedef {{step: "upload" | "receive", fraction: number | null} | {step: "work", since: number} | {step: "draw"}} Phase */
 
 const SIDES = [
@@ -142,7 +142,7 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 		let isWanted = true;
 		reader.ask("distance", { from: marks[0], to: marks[1] }).then((distance) => {
 			if (!isWanted) return;
-			setMeasured(distance ?? "unknown");
+			setMeasured(distance ?? false);
 			announce(distance ? `The points are ${withError(distance.distanceM, distance.sigmaM)} apart.` : "Their distance is not known.");
 		});
 		return () => {
@@ -382,7 +382,7 @@ function useFilesFromOutside(shown, take) {
 function DropPlace({ file, isOpening, isRefused }) {
 	const [isOver, setIsOver] = useState(false);
 	return html`<div
-		class=${isOver ? "drop over depth-drop" : "drop depth-drop"}
+		class=${`drop depth-drop ${isOver ? "over" : ""}`}
 		onDragEnter=${() => setIsOver(true)}
 		onDragLeave=${() => setIsOver(false)}
 		onDrop=${() => setIsOver(false)}
@@ -402,9 +402,9 @@ function DropPlace({ file, isOpening, isRefused }) {
 function FileButtons({ hasFile, onFiles }) {
 	const chosen = useRef(/** @type {HTMLInputElement | null} */ (null));
 	const taken = useRef(/** @type {HTMLInputElement | null} */ (null));
-	const onChange = (/** @type {any} */ event) => {
-		onFiles(event.target.files);
-		event.target.value = ""; // the same file may be chosen again
+	const onChange = (/** @type {any} */ { target }) => {
+		onFiles(target.files);
+		target.value = ""; // the same file may be chosen again
 	};
 	return html`<div class="row depth-files">
 		<button type="button" class=${hasFile ? "" : "primary"} onClick=${() => chosen.current?.click()}>

@@ -9,7 +9,7 @@ const DIRECTORY_ENTRY_BYTES = 46;
 const LOCAL_HEADER_BYTES = 30;
 const MAGIC_BYTES = 10;
 /** @type {Record<string, Float32ArrayConstructor | Float64ArrayConstructor | Uint8ArrayConstructor>} */
-const KINDS = { "<f4": Float32Array, "<f8": Float64Array, "|b1": Uint8Array, "|u1": Uint8Array };
+const KINDS = { "<f4": Float32Array, "<f8": Float64Array, "|b1": Uint8Array };
 
 /**
  * Only one array is in memory twice at a time, and the zip itself never.

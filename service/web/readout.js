@@ -54,11 +54,11 @@ export function Distance({ marks, measured, hasPoints, onClear }) {
 		if (!hasPoints) return "Needs the camera's focal length: give the camera its lens or its intrinsics.";
 		if (marks.length === 0) return "Click two points of the picture.";
 		if (marks.length === 1) return "Click the second point.";
-		return measured === "unknown" ? "One of the points has no answer, or no ray meets it by the camera's distortion." : "";
+		return measured === false ? "One of the points has no answer, or no ray meets it by the camera's distortion." : "";
 	};
 	return html`<section class="card stack" aria-label="Distance in space">
 		<h3>Distance in space</h3>
-		${measured !== null && measured !== "unknown"
+		${measured
 			? html`<p class="depth-metres">
 					<strong data-value="distance">${inMetres(measured.distanceM)} m</strong>${" "}
 					<span data-value="distance-sigma">± ${inMetres(measured.sigmaM, measured.distanceM)} m</span>
@@ -74,17 +74,7 @@ export function Timings({ timings, model }) {
 	const totalMs = timings.reduce((sum, [, ms]) => sum + ms, 0);
 	return html`<details class="card">
 		<summary>The service took ${(totalMs / 1000).toFixed(2)} s</summary>
-		<table>
-			<tbody>
-				${timings.map(
-					([stage, ms]) => html`<tr key=${stage}>
-						<th scope="row">${stage}</th>
-						<td class="number">${ms.toFixed(0)} ms</td>
-						<td class="bars"><div style=${{ width: `${(100 * ms) / (totalMs || 1)}%` }}></div></td>
-					</tr>`,
-				)}
-			</tbody>
-		</table>
+		<dl class="facts">${timings.map(([stage, ms]) => html`<dt>${stage}</dt><dd>${ms.toFixed(0)} ms</dd>`)}</dl>
 		<p class="hint">${model}</p>
 	</details>`;
 }

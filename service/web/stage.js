@@ -4,6 +4,7 @@ import { inMetres, withError } from "./numbers.js";
 import { latest } from "./reader.js";
 import { sideOf } from "./readout.js";
 import { html, useEffect, useMemo, useRef, useState } from "./vendor/preact.js";
+import { useWidth } from "./width.js";
 
 /** @typedef {import("./depth.js").Pixel} Pixel */
 /** @typedef {import("./maps.js").Reading} Reading */
@@ -35,10 +36,12 @@ const HINT = "depth-stage-hint";
 export function Stage(props) {
 	const { reader, size, look, bitmap, result, reading, marks, measured, known } = props;
 	const { onReading, onMarks, onCounts, announce } = props;
-	const stage = useRef(/** @type {HTMLElement | null} */ (null));
+	const [stage, width] = useWidth(0);
 	const [divider, setDivider] = useState(0);
 	const [painted, setPainted] = useState(/** @type {ImageBitmap | null} */ (null));
-	const paintPx = usePaintPx(stage, size);
+	// as wide as it is shown, in the screen's pixels
+	const most = (MOST_PX * size.width) / Math.max(size.width, size.height);
+	const paintPx = Math.round(Math.min(most, width * devicePixelRatio));
 	const drag = useRef(/** @type {{x: number, y: number, hasMoved: boolean} | null} */ (null));
 	const isByKeys = useRef(false);
 
@@ -53,8 +56,7 @@ export function Stage(props) {
 	);
 	useEffect(() => {
 		if (result && paintPx > 0) {
-			const scale = paintPx / size.width;
-			paint({ look, width: paintPx, height: Math.max(1, Math.round(size.height * scale)) });
+			paint({ look, width: paintPx, height: Math.round((size.height * paintPx) / size.width) || 1 });
 		} else {
 			setPainted(null);
 		}
@@ -236,8 +238,7 @@ function Marks({ size, reading, marks, measured, known }) {
 			${reading.depthM === null ? "no answer" : `${withError(reading.depthM, reading.sigmaM)} along the axis`}
 		<//>`}
 		${to &&
-		measured !== null &&
-		measured !== "unknown" &&
+		measured &&
 		html`<${Label}
 			left=${((from.u + to.u) / 2 + 0.5) / size.width}
 			top=${((from.v + to.v) / 2 + 0.5) / size.height}
@@ -255,26 +256,6 @@ function Label({ left, top, isBelow, name, children }) {
 	const down = isBelow ? "10px" : "calc(-100% - 10px)";
 	const style = { left: `${100 * left}%`, top: `${100 * top}%`, transform: `translate(${across}, ${down})` };
 	return html`<span class="depth-label" data-label=${name} style=${style} aria-hidden="true">${children}</span>`;
-}
-
-/**
- * How wide to paint: as wide as the picture is shown, in the screen's pixels.
- *
- * @param {{current: HTMLElement | null}} stage
- * @param {{width: number, height: number}} size
- */
-function usePaintPx(stage, size) {
-	const [px, setPx] = useState(0);
-	useEffect(() => {
-		const look = new ResizeObserver(([{ contentRect }]) => {
-			const most = (MOST_PX * size.width) / Math.max(size.width, size.height);
-			// hidden, it keeps what was painted
-			if (contentRect.width > 0) setPx(Math.round(Math.min(most, contentRect.width * devicePixelRatio)));
-		});
-		look.observe(/** @type {HTMLElement} */ (stage.current));
-		return () => look.disconnect();
-	}, [size.width, size.height]);
-	return px;
 }
 
 /** @param {Reading} reading @param {number} focusM */

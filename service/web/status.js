@@ -319,8 +319,7 @@ function Scores({ scores }) {
 		<//>
 		<p class="hint">
 			AbsRel is the mean error as a part of the distance; half of the pixels are off by less than the median error. The best
-			constant is the AbsRel of the best single distance for each picture: a model that reads depth beats it. RMSE is the root of
-			the mean squared error.
+			constant is the AbsRel of the best single distance for each picture: a model that reads depth beats it.
 		</p>
 	`;
 }
