@@ -112,11 +112,11 @@ function App() {
 	useEffect(() => {
 		function onKeyChanged() {
 			setHasKey(storedKey() !== null);
-			if (problem !== null && storedKey() !== null) reloadCameras();
+			if (storedKey() && (problem ?? cameras)) reloadCameras();
 		}
 		addEventListener(KEY_CHANGED, onKeyChanged);
 		return () => removeEventListener(KEY_CHANGED, onKeyChanged);
-	}, [problem]);
+	}, [problem, cameras]);
 
 	/** @param {KeyboardEvent} event */
 	function onKeyDown(event) {

@@ -210,6 +210,21 @@ def test_without_a_key_the_page_says_what_it_lacks(
         expect(page.get_by_role("alert").filter(visible=True)).to_have_count(0)
 
 
+def test_another_owners_key_brings_its_own_cameras(browser: Browser, keyed: Keyed, d200: dict[str, Any]) -> None:
+    known, key = keyed.keys.create("guest", "guest", EVERYDAY)
+    headers = {"Authorization": f"Bearer {key}", "Content-Type": "application/json"}
+    assert keyed.server.ask("POST", "/cameras", json.dumps({**d200, "name": "theirs"}), headers).status == 201
+    with watched(browser, keyed.server.url, [REFUSED, "status of 404"]) as page:
+        page.goto("#cameras/theirs")
+        give_key(page, key)
+        theirs = page.get_by_role("button", name="theirs")
+        expect(theirs).to_be_visible()
+        keyed.keys.revoke(known.id)
+        page.get_by_text("Revisions").click()
+        give_key(page, keyed.key())
+        expect(theirs).to_have_count(0)
+
+
 def test_photographs_of_the_sheet_ask_once_for_a_key_that_nobody_gives(browser: Browser, keyed: Keyed) -> None:
     with watched(browser, keyed.server.url, [REFUSED]) as page:
         page.goto("")
