@@ -52,6 +52,7 @@ const STEPS = {
 	draw: "Drawing",
 };
 const MOST_PX = 1600;
+const SETTLED_MS = 300;
 const NOT_THE_FRAME = "urn:camind:problem:image-size-mismatch";
 const NO_PHOTOGRAPH = /:(invalid-image|unsupported-kind)$/;
 /** @type {Look} */
@@ -170,6 +171,8 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 		setProblem(null);
 		setFailure(null);
 		show({ step: "upload", fraction: 0 });
+		await new Promise((resolve) => setTimeout(resolve, SETTLED_MS)); // arrow keys choose what they pass
+		if (signal.aborted) return;
 		announce("Sending the photograph.");
 		try {
 			const answer = await upload(depthPath({ ...ask, format: "npz" }), {

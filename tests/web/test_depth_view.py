@@ -485,6 +485,18 @@ def test_another_side_or_focus_is_read_again_and_so_is_what_was_measured(
     expect(focus).to_have_value("")
 
 
+def test_what_arrow_keys_pass_in_a_list_is_not_asked_for(measured: Page) -> None:
+    asked: list[str] = []
+    measured.on("request", lambda request: asked.append(request.url) if "/depth?" in request.url else None)
+    side = measured.get_by_role("combobox", name="Side of the plane in focus")
+    side.focus()
+    with measured.expect_response(lambda answer: "/depth?" in answer.url):
+        for key in ("ArrowDown", "ArrowDown", "ArrowUp"):
+            side.press(key)
+    stage(measured)
+    assert [parse_qs(urlsplit(url).query)["side"] for url in asked] == [["near"]]
+
+
 def test_the_side_may_be_told_before_the_photograph(opened: Page) -> None:
     choose(opened)
     opened.get_by_role("combobox", name="Side of the plane in focus").select_option("far")
