@@ -19,20 +19,20 @@ export function Readout({ reading, focusM }) {
 									<span data-value="sigma">± ${inMetres(reading.sigmaM ?? 0, reading.depthM)} m</span> along the axis`}
 					</p>
 					<dl class="facts">
-						${reading.depthM !== null &&
-						reading.rayLength !== null &&
-						html`<dt>Straight</dt>
-							<dd><span data-value="straight">${inMetres(reading.depthM * reading.rayLength)} m</span> from the lens</dd>`}
-						<dt>Side</dt>
-						<dd data-value="side">${reading.depthM === null ? "–" : sideOf(reading.depthM, reading, focusM)}</dd>
-						<dt>Or else</dt>
-						<dd data-value="other">
-							${reading.depthM === null
-								? "–"
-								: reading.otherM === null
-									? "no other distance fits"
-									: `${inMetres(reading.otherM)} m, ${percent(reading.otherM < focusM ? reading.pNear : 1 - reading.pNear)}`}
-						</dd>
+						${reading.depthM === null
+							? html`<dt>Why</dt>
+								<dd>Blur here is too strong or too unsure, or tells a distance too near, too far or on the side ruled out.</dd>`
+							: html`${reading.rayLength !== null &&
+								html`<dt>Straight</dt>
+									<dd><span data-value="straight">${inMetres(reading.depthM * reading.rayLength)} m</span> from the lens</dd>`}
+								<dt>Side</dt>
+								<dd data-value="side">${sideOf(reading.depthM, reading, focusM)}</dd>
+								<dt>Or else</dt>
+								<dd data-value="other">
+									${reading.otherM === null
+										? "no other distance fits"
+										: `${inMetres(reading.otherM)} m, ${percent(reading.otherM < focusM ? reading.pNear : 1 - reading.pNear)}`}
+								</dd>`}
 						<dt>Blur</dt>
 						<dd data-value="blur">${reading.blurPx.toFixed(2)} px</dd>
 						<dt>Pixel</dt>

@@ -497,6 +497,19 @@ def test_what_arrow_keys_pass_in_a_list_is_not_asked_for(measured: Page) -> None
     assert [parse_qs(urlsplit(url).query)["side"] for url in asked] == [["near"]]
 
 
+def test_where_there_is_no_answer_it_says_why(opened: Page) -> None:
+    pixels = cv2.imread(str(PHOTOGRAPH))
+    assert pixels is not None
+    pixels[:, :300] = cv2.GaussianBlur(pixels, (0, 0), 14)[:, :300]
+    choose(opened)
+    give(opened, cv2.imencode(".jpg", pixels)[1].tobytes())
+    picture = stage(opened)
+    picture.hover(position=place_of(picture, 120, 216))
+    told = opened.get_by_role("region", name="Under the pointer")
+    expect(told).to_contain_text("No answer here")
+    expect(told).to_contain_text("Blur here is too strong")
+
+
 def test_the_side_may_be_told_before_the_photograph(opened: Page) -> None:
     choose(opened)
     opened.get_by_role("combobox", name="Side of the plane in focus").select_option("far")
