@@ -23,6 +23,7 @@ export function ImportDialog({ file, onClose }) {
 	const [isBusy, setIsBusy] = useState(false);
 	const wanted = (steps ?? []).filter(({ does }) => does === "create" || does === "update");
 	const stored = (steps ?? []).filter(({ does }) => does === "done").length;
+	const failed = (steps ?? []).filter(({ does }) => does === "refuse").length;
 
 	useEffect(() => {
 		dialog.current?.showModal();
@@ -44,7 +45,6 @@ export function ImportDialog({ file, onClose }) {
 			<div class="stack">
 				<h2 id="import-title">Import cameras</h2>
 				${fault && html`<p class="fault" role="alert">${fault}</p>`}
-				${!fault && steps === null && html`<p role="status">Reading ${file.name} ...</p>`}
 				${steps &&
 				html`<${Table} label="What the import does" head=${["Camera", "What happens"]}>
 					${steps.map(
@@ -60,6 +60,10 @@ export function ImportDialog({ file, onClose }) {
 						Import ${counted(wanted.length, "camera")}
 					</button>`}
 					<button type="button" onClick=${() => dialog.current?.close()}>${stored > 0 ? "Close" : "Cancel"}</button>
+					<span role="status">
+						${!fault && steps === null && `Reading ${file.name} ...`}
+						${stored > 0 && !isBusy && `${counted(stored, "camera is", "cameras are")} stored, ${failed} refused`}
+					</span>
 				</div>
 			</div>
 		</dialog>

@@ -336,6 +336,7 @@ def test_what_is_exported_comes_back_after_it_is_shown(
     assert served.ask("GET", "/cameras/d200").status == 404
     plan.get_by_role("button", name="Import 2 cameras").click()
     expect(plan.get_by_role("row", name=phone["name"])).to_contain_text("as revision 2")
+    expect(plan.get_by_role("status")).to_have_text("2 cameras are stored, 1 refused")
     plan.get_by_role("button", name="Close").click()
     expect(page.get_by_role("button", name="d200")).to_be_visible()
     assert read(served, phone["name"])["k_cam_px"] == 2.5
