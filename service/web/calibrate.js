@@ -213,7 +213,7 @@ function Recent({ items, open, onOpen }) {
 	return html`
 		<details class="card" open>
 			<summary>Recent calibrations</summary>
-			<${Table} label="Recent calibrations" head=${["Camera", "Begun", "State", ""]}>
+			<${Table} label="Recent calibrations" head=${["Camera", "Begun", "State", "Open"]} numbers=${[3]}>
 				${items.map(
 					(one) => html`<tr key=${one.id}>
 						<th scope="row" class="file">${one.camera}</th>
