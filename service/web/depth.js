@@ -352,7 +352,7 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 							${result &&
 							html`<${Warnings} texts=${warned("result")} />
 								<${Readout} reading=${reading} focusM=${result.focusM} />
-								<${Distance} ...${{ marks, measured }} hasPoints=${result.facts.hasPoints} onClear=${() => setMarks([])} />`}
+								<${Distance} ...${{ marks, measured }} hasPoints=${result.facts.hasPoints} onClear=${() => (setMarks([]), setReading(null))} />`}
 							<${Tape}
 								...${{ reader, known }}
 								mark=${marks.at(-1) ?? null}

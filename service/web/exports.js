@@ -78,6 +78,7 @@ export function Exports({ result: { asked, file, npz, revision, warnings }, anno
 			<button type="button" onClick=${download}>${isBusy ? "Asking…" : "Download"}</button>
 			<button type="button" onClick=${() => copy(curlCommand)}>Copy as curl</button>
 			<button type="button" onClick=${() => copy(pythonCommand)}>Copy as Python</button>
+			<button type="button" onClick=${() => print()}>Print</button>
 		</div>
 		<${ProblemBox} problem=${problem} onClose=${() => setProblem(null)} />
 		<${Warnings} texts=${told} />

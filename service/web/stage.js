@@ -63,7 +63,7 @@ export function Stage(props) {
 	}, [result, look, paintPx]);
 
 	const read = useMemo(
-		() => latest(async (/** @type {Pixel} */ pixel) => onReading(await reader.ask("at", pixel))),
+		() => latest(async (/** @type {Pixel | null} */ pixel) => onReading(pixel && (await reader.ask("at", pixel)))),
 		[],
 	);
 
@@ -158,7 +158,7 @@ export function Stage(props) {
 			onPointerMove=${onPointerMove}
 			onPointerUp=${onPointerUp}
 			onPointerLeave=${(/** @type {PointerEvent} */ event) =>
-				event.pointerType === "mouse" && !isByKeys.current && onReading(null)}
+				event.pointerType === "mouse" && !isByKeys.current && result && read(marks.at(-1) ?? null)}
 			onKeyDown=${onKeyDown}
 		>
 			<${Bitmap} bitmap=${bitmap} name="photograph" />

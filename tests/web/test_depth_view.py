@@ -510,6 +510,25 @@ def test_where_there_is_no_answer_it_says_why(opened: Page) -> None:
     expect(told).to_contain_text("Blur here is too strong")
 
 
+def test_what_is_marked_stays_read_and_is_printed_with_its_scale(measured: Page) -> None:
+    picture = stage(measured)
+    picture.click(position=place_of(picture, 322, 216))
+    picture.hover(position=place_of(picture, 50, 50))
+    measured.get_by_role("button", name="Clear points").hover()
+    expect(measured.locator("[data-value=pixel]")).to_have_text("322, 216")
+    measured.evaluate("() => { print = () => (document.title = matchMedia('print').media); }")
+    measured.get_by_role("button", name="Print", exact=True).click()
+    expect(measured).to_have_title("print")
+    measured.emulate_media(media="print")
+    for shown in ("[data-picture=depth]", ".depth-legend", "[data-label=reading]", "[data-value=sigma]"):
+        expect(measured.locator(shown)).to_be_visible()
+    expect(measured.locator(":is(nav, button, form):visible")).to_have_count(0)
+    expect(measured.get_by_role("region", name="Colours")).to_have_count(0)
+    measured.emulate_media(media="screen")
+    measured.get_by_role("button", name="Clear points").click()
+    expect(measured.locator("[data-value=pixel]")).to_have_count(0)
+
+
 def test_the_side_may_be_told_before_the_photograph(opened: Page) -> None:
     choose(opened)
     opened.get_by_role("combobox", name="Side of the plane in focus").select_option("far")
