@@ -1,6 +1,7 @@
 """The command ``camind``. Further commands come from packages that register in ``camind.commands``."""
 
 import io
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -114,6 +115,7 @@ def back_up(
     """
     from service.storage.backup import backup, using
 
+    _end_in_order()
     settings = _settings()
     database = _database_file(settings)
     with _plain_failures(), using(settings.effective_database_url):
@@ -135,6 +137,7 @@ def restore(
     from service.storage.backup import restore as put_back
     from service.storage.spool import known_id
 
+    _end_in_order()
     settings = _settings()
     database = database_file(settings.effective_database_url)
     with _plain_failures():
@@ -500,6 +503,13 @@ def revoke_key(key_id: Annotated[str, typer.Argument(help="As `camind keys list`
     with _plain_failures(), _ready_engine() as engine:
         key = Keys(engine).revoke(key_id)
     typer.echo(f"Key {key.id} ({key.name}) is refused from now on.")
+
+
+def _end_in_order() -> None:
+    """Let signals that would end the process at once end it as an error does: no half of a database is left behind."""
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, lambda number, _: sys.exit(128 + number))
 
 
 def _settings(**overrides: object) -> Settings:

@@ -1,7 +1,9 @@
 """A backup is of one moment, whole and checked; a restore leaves the old database or the new one, never a mixture."""
 
+import os
 import re
 import shutil
+import signal
 import sqlite3
 import subprocess
 import sys
@@ -56,6 +58,16 @@ while status != 0:
     status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     assert status in (0, -signal.SIGKILL), status
     moment += step
+"""
+
+# A command of camind's that is sent a signal where it has made its copy's file and opens a database.
+ENDED_COMMAND = """
+import os, sys
+from service.cli import main
+
+number = int(sys.argv.pop(1))
+sys.addaudithook(lambda event, _: event == "sqlite3.connect" and os.kill(os.getpid(), number))
+main()
 """
 
 
@@ -333,3 +345,14 @@ def test_a_kill_at_any_moment_of_a_restore_leaves_the_old_or_the_new(database: P
     assert found == sorted(found, reverse=True)
     assert (found[0], found[-1]) == (OLD, ["new"])
     assert all(names in (OLD, ["new"]) for names in found)
+
+
+@pytest.mark.parametrize(("command", "number"), [("backup", signal.SIGTERM), ("restore", signal.SIGHUP)])
+def test_a_signal_to_end_leaves_no_half_copy(database: Path, copy: Path, command: str, number: signal.Signals) -> None:
+    file = copy if command == "restore" else copy.with_name("another.sqlite3")
+    environment = {**os.environ, "CAMIND_DATA_DIR": str(database.parent)}
+    arguments = [sys.executable, "-c", ENDED_COMMAND, str(int(number)), command, file]
+    assert subprocess.run(arguments, env=environment, check=False).returncode == 128 + number
+    assert files_of(copy.parent) == {"data", copy.name}
+    assert files_of(database.parent) == {database.name, f"{database.name}.lock"}
+    assert names_in(database) == OLD
