@@ -19,8 +19,8 @@ def make_private(folder: Path) -> None:
 
 
 def try_lock(path: Path, *, is_shared: bool = False) -> BinaryIO | None:
-    """The file, made if it is not there and locked until it is closed; None while others hold it."""
-    file = path.open("ab")
+    """The file, made for its owner alone if it is not there, locked until it is closed; None while others hold it."""
+    file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600), "ab")
     try:
         fcntl.flock(file, (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:

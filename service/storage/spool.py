@@ -47,7 +47,7 @@ class Spool:
         self._incoming += 1
         try:
             with storing():
-                (self._folder / draft).mkdir()
+                (self._folder / draft).mkdir(mode=0o700)
                 lock = try_lock(self._folder / draft / LOCK_FILE)
                 folder = (self._folder / draft).rename(self._folder / calibration_id)
             yield folder

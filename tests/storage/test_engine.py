@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
+from uuid import uuid4
 
 import pytest
 from sqlalchemy import Engine
@@ -14,6 +15,7 @@ from sqlalchemy.exc import DatabaseError, IntegrityError
 
 from service.errors import Busy, NotReady
 from service.storage import postgresql, schema
+from service.storage.backup import using
 from service.storage.cameras import Cameras
 from service.storage.engine import journal_mode, open_engine, reading, require_writable, writing
 from service.storage.spool import Spool
@@ -49,12 +51,18 @@ def test_what_is_stored_is_for_its_owner_alone(tmp_path: Path) -> None:
         for folder in (tmp_path / "new", open_folder):
             engine = open_engine(f"sqlite:///{folder / 'a.sqlite3'}")
             schema.upgrade(engine)
-            with writing(engine):
+            with using(engine.url), writing(engine):
                 assert {path.stat().st_mode & 0o777 for path in folder.iterdir()} == {0o600}
         Spool(open_folder / "calibrations")
+        # as made by a version that left it to be looked into
+        open_spool = tmp_path / "open" / "spool"
+        open_spool.mkdir()
+        with Spool(open_spool).receiving(uuid4().hex) as photographs:
+            received = photographs.stat().st_mode & 0o777
     finally:
         os.umask(before)
     private, kept = (folder.stat().st_mode & 0o777 for folder in (tmp_path / "new", open_folder))
+    assert received == 0o700
     assert (private, kept, (open_folder / "calibrations").stat().st_mode & 0o777) == (0o700, 0o777, 0o700)
 
 
