@@ -417,7 +417,7 @@ def _why(cells: dict[Cell, int], blobs: _Blobs, wanted: list[Cell], grid: Circle
 
 
 def _likeness(cells: dict[Cell, int], blobs: _Blobs, grid: CircleGrid) -> str:
-    """Which pattern the lattice looks like instead, the one most like the one given, to be said after it."""
+    """Which pattern the lattice looks like instead, the one most like what is seen and given, to be said after it."""
     a, b = np.array(list(cells)).T
     across, along, rising, falling = (_extent(places) for places in (a, b, a + b, a - b))
     sizes: list[tuple[Kind, int, int]] = [
@@ -429,7 +429,7 @@ def _likeness(cells: dict[Cell, int], blobs: _Blobs, grid: CircleGrid) -> str:
     given = (grid.kind, grid.rows, grid.columns)
     sizes = [size for size in sizes if size != given and min(size[1:]) >= 2]
     over = {(b, a): blob for (a, b), blob in cells.items()}  # axes may be named either way round, and are only turned
-    for kind, rows, columns in sorted(sizes, key=lambda size: _unlikeness(size, given)):
+    for kind, rows, columns in sorted(sizes, key=lambda size: _unlikeness(size, given, len(cells))):
         other = CircleGrid(kind, rows, columns, 2.0, 1.0)
         if any(_laid(lattice, blobs, _lattice_cells(other), other) for lattice in (cells, over)):
             return f"; it looks like {rows} rows, {columns} columns" + f" of {kind}" * (kind != grid.kind)
@@ -442,5 +442,6 @@ def _extent(places: NDArray[np.int64]) -> int:
     return int(np.ptp(lines[count > 1])) + 1 if (count > 1).any() else 0
 
 
-def _unlikeness(size: tuple[Kind, int, int], given: tuple[Kind, int, int]) -> tuple[bool, int]:
-    return size[0] != given[0], abs(size[1] - given[1]) + abs(size[2] - given[2])
+def _unlikeness(size: tuple[Kind, int, int], given: tuple[Kind, int, int], circles: int) -> tuple[int, bool, int]:
+    missing = abs(size[1] * size[2] - circles)
+    return missing, size[0] != given[0], abs(size[1] - given[1]) + abs(size[2] - given[2])

@@ -222,3 +222,10 @@ def test_blobs_are_looked_for_in_steps_that_can_be_stopped() -> None:
 
     with pytest.raises(Stopped):
         find_grid(drawn(TALL, view(TALL)), TALL, check)
+
+
+@pytest.mark.parametrize("columns", [3, 6])
+def test_what_it_looks_like_has_the_circles_that_were_seen(columns: int) -> None:
+    sheet = CircleGrid("asymmetric_circles", 7, 3, 26.0, 18.0)  # all but the corners of 5 rows of 5, aslant
+    with pytest.raises(GridError, match="looks like 7 rows, 3 columns of asymmetric_circles"):
+        find_grid(drawn(sheet, view(sheet)), CircleGrid("symmetric_circles", 7, columns, 26.0, 18.0))
