@@ -22,6 +22,7 @@ BAD_RMS_PART = 0.008  # of the spacing
 FREE_VIEWS, CLEARLY = 6, 0.75
 TELL_BENT_PART = 0.025  # of the spacing
 MOST_FOCAL_ERROR = 0.1
+NEAR_M = 0.01  # all sheets nearer than that: their spacing may have been told in metres
 CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-10)
 
 
@@ -80,6 +81,9 @@ def place(grid: CircleGrid, views: Sequence[View], size_px: tuple[int, int]) -> 
     ]
     middle = board.mean(0)
     tilts = [_tilt_deg(turn) for turn in turns]
+    distances = [
+        float((turn @ middle)[2] + shift[2, 0]) / 1e3 for turn, shift in zip(turns, solved.shifts, strict=True)
+    ]
     matrix = solved.matrix
     focal_error = _focal_error(board, views, solved)
     if focal_error > MOST_FOCAL_ERROR:
@@ -96,12 +100,12 @@ def place(grid: CircleGrid, views: Sequence[View], size_px: tuple[int, int]) -> 
             tuple(solved.distortion.ravel().tolist()),
         ),
         tuple(depths),
-        tuple(float((turn @ middle)[2] + shift[2, 0]) / 1e3 for turn, shift in zip(turns, solved.shifts, strict=True)),
+        tuple(distances),
         tuple(tilts),
         tuple(solved.errors.tolist()),
         solved.rms,
         focal_error,
-        (*_warnings(grid, views, solved, tilts), *_imperfect(grid, bent_mm)),
+        (*_near(distances), *_warnings(grid, views, solved, tilts), *_imperfect(grid, bent_mm)),
     )
 
 
@@ -258,6 +262,15 @@ def _bias(board: Array, grid: CircleGrid, view: View, solved: _Solved, number: i
     cross = outlines[..., 0] * after[..., 1] - outlines[..., 1] * after[..., 0]
     # the centroid of the outline's polygon, from the centre's image
     return np.asarray(((outlines + after) * cross[..., None]).sum(1) / (3 * cross.sum(1))[:, None])
+
+
+def _near(distances: Sequence[float]) -> list[str]:
+    if max(distances) >= NEAR_M:
+        return []
+    return [
+        f"by what was told of the sheet it stood at most {1e3 * max(distances):.2g} mm from the lens: give spacing_mm "
+        "and diameter_mm in millimetres"
+    ]
 
 
 def _imperfect(grid: CircleGrid, bent_mm: float) -> list[str]:

@@ -136,3 +136,10 @@ def test_a_sheet_stands_where_it_was_placed() -> None:
     for number, view in enumerate(seen):
         expected = found.distance_m[number], found.tilt_deg[number]
         assert stand(GRID, view, found.intrinsics) == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize("size", [0.001, 0.1])
+def test_a_sheet_told_in_metres_is_noticed(size: float) -> None:
+    grid = CircleGrid(GRID.kind, GRID.rows, GRID.columns, size * GRID.spacing_mm, size * GRID.diameter_mm)
+    said = [warning for warning in place(grid, views(flat())[0], SIZE).warnings if "in millimetres" in warning]
+    assert ["0.75 mm from the lens" in warning for warning in said] == [True] * (size == 0.001)
