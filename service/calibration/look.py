@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from service.calibration.measure import CLIPPED_LEVEL, Measured, measure, otherwise_sized
+from service.calibration.measure import CLIPPED_LEVEL, DARK_LEVEL, Measured, measure, otherwise_sized
 from service.calibration.pose import View, stand
 from service.calibration.report import PictureReport
 from service.calibration.target import CircleGrid
@@ -19,7 +19,6 @@ Exposure = Literal["good", "over", "under"]
 
 WHITE_LEVEL = 255
 MOST_MEASURED = 12
-DARK_LEVEL = 80  # of the paper: below, noise is a large part of the circles' contrast
 CLIPPED_CIRCLES = 0.1
 
 

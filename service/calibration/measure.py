@@ -17,6 +17,7 @@ from service.optics.light import decode_srgb
 
 LEAST_CIRCLES = 8
 CLIPPED_LEVEL = 252
+DARK_LEVEL = 80  # of the paper: below, noise is a large part of the circles' contrast
 PLATEAU, PLATEAU_CIRCLES, LEAST_PLATEAU = 0.7, 0.5, 160  # of the paper at one level, of the circles so, from where on
 OTHER_SIZE = 1.1  # paper shrinks and ink spreads less
 PAPER_FROM_RADII, PAPER_TO_RADII = 1.3, 1.6
@@ -131,6 +132,7 @@ def _measure_circles(
         out.centres_px.append((edge.x_px + left, edge.y_px + top))
         out.edges.append(edge)
     _warn_of_plateau(out)
+    _warn_of_dark(out)
     for reason, count in reasons.most_common(3):
         out.warn(f"{count} of {len(chosen)} circles not measured: {reason}")
     if every == 1 and 0 < len(out.circles) < LEAST_CIRCLES:
@@ -161,6 +163,16 @@ def _warn_of_plateau(out: Measured) -> None:
         f"the paper is at level {level} nearly everywhere, as if white were cut off there, which makes blur look "
         "smaller: expose less, and send the file as the camera wrote it"
     )
+
+
+def _warn_of_dark(out: Measured) -> None:
+    """In the dark noise is as large as what tells blur, and cut off at black."""
+    level = float(np.median(out.paper_levels))
+    if level < DARK_LEVEL:
+        out.warn(
+            f"underexposed: the paper is at level {level:.0f} of 255, where noise falsifies blur: expose more, so that "
+            "white is light grey"
+        )
 
 
 def _commonest(levels: NDArray[np.integer]) -> tuple[int, float]:

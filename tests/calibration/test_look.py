@@ -99,3 +99,12 @@ def test_a_partner_of_another_size_does_not_serve() -> None:
     measure(out, np.full((300, 400, 3), 200, np.uint8), SHEETS[0], lambda _: None, partner=partner)
     assert partner.grid is not None
     assert out.grid is None
+
+
+@pytest.mark.parametrize(("part", "is_dark"), [(0.3, True), (0.5, False)])
+def test_a_photograph_too_dark_to_measure_well_is_noticed(part: float, is_dark: bool) -> None:
+    rng = np.random.default_rng(3)
+    taken = photograph(rng, CAMERA, draw_pose(rng, CAMERA, SHEETS[0], 0.42), SHEETS[0], focused=False)
+    dark = (part * taken).astype(np.uint8)
+    said = [warning for warning in look(dark, SHEETS[0], None).warnings if "exposed" in warning]
+    assert ["expose more" in warning for warning in said] == [True] * is_dark
