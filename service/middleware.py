@@ -1,13 +1,14 @@
 """Around every request, in pure ASGI: an id, one log event, metrics, limits on what is received, HEAD.
 
 From the outside in: ``access.AllowOrigins``, ``ObserveRequests``, ``AnswerHead``, ``access.Authenticate``,
-``LimitRequests``, then the routes.
+``LimitRequests``, then the routes. ``EndConnections`` is the server's, around all of them.
 """
 
 import asyncio
 import re
 import time
 from collections.abc import Mapping, MutableMapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from urllib.parse import parse_qs
 from uuid import uuid4
@@ -140,6 +141,54 @@ class AnswerHead:
             await self._app(inner, receive, bodiless)
         finally:
             _hand_back(inner, scope)
+
+
+class EndConnections:
+    """Ends a connection where what comes next on it could be taken wrongly, and ends none before the answer is through.
+
+    An answer says ``Connection: close`` where the body had two lengths (RFC 9112, 6.1), or where the client waits for
+    ``100 Continue`` and may send the body or another request. Before a connection is closed, what still comes of the
+    body is thrown away, for ``deadline_s`` at most: a reset would take the answer along.
+    """
+
+    def __init__(self, app: ASGIApp, deadline_s: float) -> None:
+        self._app = app
+        self._deadline_s = deadline_s
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        is_last = scope["http_version"] == "1.0" or "close" in headers.get("connection", "").lower()
+        is_unclear = "transfer-encoding" in headers and "content-length" in headers
+        is_waiting = headers.get("expect", "").lower() == "100-continue"
+        is_whole = is_answered = False
+
+        async def followed() -> Message:
+            nonlocal is_waiting, is_whole
+            is_waiting = False
+            message = await receive()
+            is_whole = not message.get("more_body", False)
+            return message
+
+        async def ending(message: Message) -> None:
+            nonlocal is_last, is_answered
+            if message["type"] == "http.response.start" and (is_unclear or is_waiting):
+                is_last = True
+                MutableHeaders(scope=message)["Connection"] = "close"
+            elif message["type"] == "http.response.body" and is_last and not message.get("more_body", False):
+                is_answered = True
+                message = {**message, "more_body": True}
+            await send(message)
+
+        await self._app(scope, followed, ending)
+        if is_answered:
+            with suppress(TimeoutError):
+                async with asyncio.timeout(self._deadline_s):
+                    while not is_whole:
+                        await followed()
+            await send({"type": "http.response.body"})
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,7 @@ from service.api.problems import PROBLEM_TYPE, problem
 from service.config import Settings
 from service.errors import BadRequest, CamindError, ReceiveTimeout
 from service.memory import keep_freed_memory
-from service.middleware import REQUEST_ID, request_id_of
+from service.middleware import REQUEST_ID, EndConnections, request_id_of
 
 GRACE_S = 1.0
 KEEP_ALIVE_S = 75  # longer than what proxies keep: who closes last is never asked on a connection just closed
@@ -247,7 +247,7 @@ def serve(app: FastAPI, settings: Settings, listener: socket.socket) -> bool:
     own = {"deadline_s": settings.receive_deadline_s + GRACE_S, "count_problem": app.state.metrics.count_problem}
     protocol = type("Protocol", (DeadlineProtocol,), own)
     config = uvicorn.Config(
-        app,
+        EndConnections(app, settings.receive_deadline_s),
         http=protocol,
         backlog=LET_IN,
         h11_max_incomplete_event_size=MOST_HEADER_BYTES,

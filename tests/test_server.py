@@ -115,6 +115,37 @@ def test_a_body_that_is_too_large_is_answered_though_it_was_sent_whole(server: S
     connection.close()
 
 
+@pytest.mark.parametrize("version", ["1.0", "1.1"])
+def test_an_answer_comes_through_before_its_connection_is_closed(server: Server, version: str) -> None:
+    head = f"POST /depth?camera=x HTTP/{version}\r\nHost: x\r\nConnection: close\r\nContent-Type: text/plain\r\n"
+    with server.connect() as connection:
+        connection.sendall(f"{head}Content-Length: 150000\r\n\r\n".encode())
+        for _ in range(15):
+            time.sleep(0.02)
+            connection.sendall(b" " * 10_000)
+        assert read_to_end(connection)[0] == 415
+
+
+BOTH_LENGTHS = b"Content-Length: 2\r\nTransfer-Encoding: chunked\r\n\r\n2\r\n{}\r\n0\r\n\r\n"
+
+
+@pytest.mark.parametrize("rest", [b"Expect: 100-continue\r\nContent-Length: 9\r\n\r\n", BOTH_LENGTHS])
+def test_a_connection_ends_where_a_body_could_be_taken_for_a_request(server: Server, rest: bytes) -> None:
+    with server.connect() as connection:
+        connection.sendall(b"POST /depth?camera=x HTTP/1.1\r\nHost: x\r\nContent-Type: text/plain\r\n" + rest)
+        status, headers, _ = read_to_end(connection)
+    assert (status, headers["connection"]) == (415, "close")
+
+
+def test_a_client_that_waits_to_send_its_body_is_told_to(server: Server) -> None:
+    head = b"POST /cameras HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nExpect: 100-continue\r\n"
+    with server.connect() as connection:
+        connection.sendall(head + b"Content-Length: 2\r\n\r\n")
+        assert connection.recv(100).startswith(b"HTTP/1.1 100 ")
+        connection.sendall(b"{}GET /health/live HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
+        assert read_to_end(connection)[0] == 200
+
+
 def test_a_body_that_grows_too_large_is_refused_while_it_comes(server: Server) -> None:
     chunks = (b" " * 10_000 for _ in range(100))
     headers = {"Content-Type": "application/json"}
