@@ -18,5 +18,10 @@ class Principal:
     owner: str
     key_id: str | None = None
 
+    @property
+    def sharer(self) -> str | None:
+        """The owner, where others may have keys too; None where all is one owner's."""
+        return self.owner if self.key_id else None
+
 
 ANYBODY = Principal(LOCAL)

@@ -3,6 +3,7 @@
 import asyncio
 import hashlib
 import json
+from collections import Counter
 from collections.abc import AsyncIterator, Iterator
 from contextlib import suppress
 from typing import Annotated
@@ -50,6 +51,7 @@ from service.errors import (
     UnsupportedKind,
 )
 from service.inference.images import MEDIA_TYPES
+from service.principal import Principal
 from service.runner import RESULT
 from service.storage.calibrations import ID_PATTERN, CalibrationDraft, CalibrationRecord, Calibrations
 from service.storage.idempotency import once_of
@@ -135,9 +137,10 @@ async def create_calibration(
     idempotency_key: IdempotencyKey = None,
 ) -> CalibrationRead:
     """Queue a calibration. It is worked on one at a time, survives a restart, and its photographs go when it ends."""
-    await _require_room(calibrations, spool, settings.calibration_queue_size, idempotency_key)
+    principal: Principal = request.state.principal
+    await _require_room(calibrations, spool, settings.calibration_queue_size, principal.sharer, idempotency_key)
     limits = FormLimits(settings.max_calibration_images, settings.max_image_bytes, settings.max_json_bytes)
-    record = await _received(request, camera, limits, calibrations, spool, idempotency_key)
+    record = await _received(request, camera, limits, calibrations, spool, owner, idempotency_key)
     runner.wake()
     response.headers["Location"] = f"/calibrations/{record.id}"
     wait_s = wait_of(prefer)
@@ -251,12 +254,18 @@ def cancel_calibration(
     runner.wake()
 
 
-async def _require_room(calibrations: Calibrations, spool: Spool, queue_size: int, idempotency_key: str | None) -> None:
+async def _require_room(
+    calibrations: Calibrations, spool: Spool, queue_size: int, sharer: str | None, idempotency_key: str | None
+) -> None:
     """What was done before will not wait once more, but its photographs arrive like others."""
     is_repeated = idempotency_key is not None and await run_in_threadpool(calibrations.has_done, idempotency_key)
-    waiting = 0 if is_repeated else await run_in_threadpool(calibrations.waiting, spool.id)
-    if waiting + spool.incoming >= queue_size:
-        raise Busy(f"{queue_size} calibrations wait already: try again later.", retry_after_s=RETRY_AFTER_S)
+    waiting = Counter[str]() if is_repeated else await run_in_threadpool(calibrations.waiting, spool.id)
+    held = waiting + spool.incoming
+    own = held[sharer] if sharer is not None else 0
+    if held.total() + own >= queue_size:
+        whose = f", {own} of them this owner's" if own else ""
+        detail = f"{held.total()} calibrations wait already{whose}: try again later."
+        raise Busy(detail, retry_after_s=RETRY_AFTER_S)
 
 
 async def _received(
@@ -265,11 +274,12 @@ async def _received(
     limits: FormLimits,
     calibrations: Calibrations,
     spool: Spool,
+    owner: str,
     idempotency_key: str | None,
 ) -> CalibrationRecord:
     """The calibration in a request's form, with its photographs on the disk and its row in the database."""
     calibration_id = uuid4().hex
-    with spool.receiving(calibration_id) as folder:
+    with spool.receiving(calibration_id, owner) as folder:
         form = await receive_form(request, folder, limits)
         wanted = CalibrationSettings.from_form(form.settings)
         draft = CalibrationDraft(calibration_id, spool.id, camera, wanted.model_dump(mode="json"), form.pictures)

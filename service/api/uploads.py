@@ -4,6 +4,7 @@ How large a body may be is for ``LimitRequests``, in front of every route, to sa
 """
 
 import sys
+from collections import Counter
 from collections.abc import AsyncGenerator, Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from starlette.formparsers import MultiPartException, MultiPartParser
 
 from service.errors import BadRequest, Busy
 from service.inference.images import MEDIA_TYPES, declared_kind
+from service.principal import Principal
 
 FIELD = "image"
 MULTIPART = "multipart/form-data"
@@ -47,31 +49,32 @@ class Upload:
 
 
 class Arrivals:
-    """Photographs that have arrived in part: their bytes, over all requests, are bounded, as the queue is.
+    """Photographs that have arrived in part: their bytes, over all requests, are bounded and shared, as the queue is.
 
     For the event loop alone.
     """
 
     def __init__(self, most_bytes: int) -> None:
         self._most_bytes = most_bytes
-        self._held_bytes = 0
+        self._held_bytes: Counter[str | None] = Counter()
 
     @contextmanager
-    def counted(self) -> Iterator[Callable[[int], None]]:
+    def counted(self, sharer: str | None = None) -> Iterator[Callable[[int], None]]:
         """Gives a function that counts some more bytes, or raises ``Busy``; all are given back at the end."""
-        own_bytes = 0
+        taken_bytes = 0
 
         def take(count: int) -> None:
-            nonlocal own_bytes
-            if self._held_bytes + count > self._most_bytes:
+            nonlocal taken_bytes
+            own_bytes = self._held_bytes[sharer] if sharer is not None else 0
+            if self._held_bytes.total() + own_bytes + count > self._most_bytes:
                 raise Busy("Too many photographs arrive at once: try again later.")
-            self._held_bytes += count
-            own_bytes += count
+            self._held_bytes[sharer] += count
+            taken_bytes += count
 
         try:
             yield take
         finally:
-            self._held_bytes -= own_bytes
+            self._held_bytes[sharer] -= taken_bytes
 
 
 async def receive_photograph(request: Request) -> Upload:
@@ -82,7 +85,8 @@ async def receive_photograph(request: Request) -> Upload:
     """
     media_type = request.headers.get("content-type")
     arrivals: Arrivals = request.app.state.arrivals
-    with arrivals.counted() as take:
+    principal: Principal = request.state.principal
+    with arrivals.counted(principal.sharer) as take:
         if media_type is not None and media_type.lower().startswith(MULTIPART):
             return await _from_form(request, take)
         declared_kind(media_type)

@@ -7,6 +7,7 @@ photographs, of one data folder.
 
 import re
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime, timedelta
@@ -14,6 +15,7 @@ from typing import Literal, get_args
 
 from pydantic import JsonValue
 from sqlalchemy import Engine, delete, func, update
+from sqlalchemy.orm import aliased
 from sqlmodel import Session, col, select
 
 from service.errors import Conflict, NotFound
@@ -150,11 +152,14 @@ class Calibrations:
             summaries = [CalibrationSummary(*row) for row in session.exec(query)]
         return summaries[:limit], len(summaries) > limit
 
-    def waiting(self, spool: str) -> int:
-        """How many of a spool's calibrations are queued."""
-        query = select(func.count()).where(col(CalibrationRow.spool) == spool, col(CalibrationRow.state) == "queued")
+    def waiting(self, spool: str) -> Counter[str]:
+        """How many of a spool's calibrations are queued, by owner."""
+        owner = col(CalibrationRow.owner)
+        query = select(owner, func.count()).where(
+            col(CalibrationRow.spool) == spool, col(CalibrationRow.state) == "queued"
+        )
         with reading(self._engine) as session:
-            return session.exec(query).one()
+            return Counter(dict(session.exec(query.group_by(owner)).all()))
 
     def live_counts(self, spool: str) -> dict[State, int]:
         """How many of a spool's calibrations are queued, and how many running."""
@@ -171,13 +176,22 @@ class Calibrations:
             return set(session.exec(query))
 
     def take(self, spool: str) -> CalibrationRecord | None:
-        """The spool's next in line, now running; None where nothing waits, which costs no lock."""
+        """The spool's next in line, now running: the first of the owner who was served longest ago.
+
+        None where nothing waits, which costs no lock.
+        """
         if not self.waiting(spool):
             return None
+        other = aliased(CalibrationRow)
+        served_at = (
+            select(func.max(other.updated_at))
+            .where(other.spool == spool, other.owner == CalibrationRow.owner, other.state != "queued")
+            .scalar_subquery()
+        )
         query = (
             select(CalibrationRow)
             .where(col(CalibrationRow.spool) == spool, col(CalibrationRow.state) == "queued")
-            .order_by(col(CalibrationRow.number))
+            .order_by(served_at.nulls_first(), col(CalibrationRow.number))
             .limit(1)
             .with_for_update()
         )

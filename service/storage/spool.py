@@ -7,12 +7,14 @@ an id in a file. A folder is locked while it is filled, from before it has its n
 import re
 import shutil
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 from uuid import uuid4
 
+from service.principal import LOCAL
 from service.storage.calibrations import ID_PATTERN
 from service.storage.disk import make_private, storing, sync_folder, try_lock, write_through
 
@@ -29,22 +31,22 @@ class Spool:
         make_private(folder)
         self._folder = folder
         self._lock: BinaryIO | None = None
-        self._incoming = 0
+        self._incoming: Counter[str] = Counter()
         self.id = _id_in(folder)
 
     @property
-    def incoming(self) -> int:
-        """How many calibrations this process is receiving now."""
-        return self._incoming
+    def incoming(self) -> Counter[str]:
+        """How many calibrations this process is receiving now, by owner."""
+        return self._incoming.copy()
 
     @contextmanager
-    def receiving(self, calibration_id: str) -> Iterator[Path]:
+    def receiving(self, calibration_id: str, owner: str = LOCAL) -> Iterator[Path]:
         """A new folder to be filled; it is removed again where that fails.
 
         Raises ``InsufficientStorage`` and ``NotReady`` where it cannot be made.
         """
         draft, lock = f".{calibration_id}", None
-        self._incoming += 1
+        self._incoming[owner] += 1
         try:
             with storing():
                 (self._folder / draft).mkdir(mode=0o700)
@@ -58,7 +60,7 @@ class Spool:
         finally:
             if lock is not None:
                 lock.close()
-            self._incoming -= 1
+            self._incoming[owner] -= 1
 
     def seal(self, calibration_id: str) -> None:
         """Put the folder on the disk; its files were before, each with ``write_through``. Raises as ``receiving``."""

@@ -75,11 +75,11 @@ def test_nothing_is_lost(calibrations: Calibrations) -> None:
 def test_the_first_to_come_is_the_first_to_run(calibrations: Calibrations) -> None:
     ids = [calibrations.add(draft()).id for _ in range(3)]
     calibrations.add(draft(OTHER_SPOOL))
-    assert calibrations.waiting(SPOOL) == 3
+    assert calibrations.waiting(SPOOL).total() == 3
     taken = [calibrations.take(SPOOL) for _ in range(4)]
     assert [record and record.id for record in taken] == [*ids, None]
-    assert calibrations.waiting(SPOOL) == 0
-    assert calibrations.waiting(OTHER_SPOOL) == 1
+    assert calibrations.waiting(SPOOL).total() == 0
+    assert calibrations.waiting(OTHER_SPOOL).total() == 1
 
 
 def test_one_of_many_takes_what_waits(calibrations: Calibrations) -> None:
