@@ -15,7 +15,7 @@ from service.api.problems import invalid_request
 from service.api.shares import Share
 from service.api.texts import Worded
 from service.config import Settings
-from service.errors import UnsupportedKind
+from service.errors import BadRequest, UnsupportedKind
 from service.inference.artifact import ModelFolder
 from service.inference.estimator import Estimator
 from service.principal import Principal
@@ -23,6 +23,8 @@ from service.runner import Runner
 from service.storage.calibrations import Calibrations
 from service.storage.cameras import Cameras
 from service.storage.spool import Spool
+
+MOST_PARAMETERS = 1_200  # more than all that any route takes, its lists filled
 
 
 async def get_settings(request: Request) -> Settings:
@@ -82,10 +84,12 @@ async def count_follower(
 
 
 async def require_known_parameters(request: Request) -> None:
-    """Refuse what the query has and the route does not know, and all but lists that come more than once."""
+    """Refuse what the query has and the route does not know, all but lists that come more than once, and too many."""
     names = [name for name, _ in request.query_params.multi_items()]
     if not names:
         return
+    if len(names) > MOST_PARAMETERS:  # a fault found in each would hold up everybody for half a second
+        raise BadRequest(f"A query may have at most {MOST_PARAMETERS} parameters, not {len(names)}: send fewer.")
     is_list = {
         field.alias: get_origin(field.field_info.annotation) in (list, tuple)
         for field in get_flat_params(request.scope["route"].dependant)

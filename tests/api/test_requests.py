@@ -43,6 +43,16 @@ def test_too_much_at_once_is_busy_and_is_forgotten(app: FastAPI, client: TestCli
         assert client.post("/photographs/preview", **sent).status_code == 200
 
 
+@pytest.mark.parametrize("name", ["at", "nothing"])
+def test_a_query_of_too_many_parameters_is_not_looked_through(client: TestClient, name: str) -> None:
+    answer = client.post(f"/depth?camera=x&{'&'.join([name] * 1200)}", content=png(corners()))
+    assert (answer.status_code, answer.json()["detail"].split(":")[0]) == (
+        422,
+        "A query may have at most 1200 parameters, not 1201",
+    )
+    assert "errors" not in answer.json()
+
+
 def test_a_compressed_body_is_refused_by_that_name(client: TestClient) -> None:
     for path, body in (("/cameras", b"{}"), ("/photographs/preview", png(corners()))):
         refused = client.post(path, content=gzip.compress(body), headers={"Content-Encoding": "gzip"})
