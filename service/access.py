@@ -7,6 +7,7 @@ A scope is asked for by path, before a route or a body is looked at; a path that
 """
 
 import math
+import re
 import time
 from collections.abc import Collection
 from ipaddress import ip_address
@@ -41,6 +42,8 @@ SCOPES_BY_PATH: dict[str, tuple[KeyScope | None, KeyScope | None]] = {
     "/calibrations": ("calibrate", "calibrate"),
     "/metrics": ("admin", "admin"),
 }
+# a name or an address, and a port: what looks like more is no such name
+HOST = re.compile(r"(?P<name>\[[0-9A-Fa-f:.]+\]|[^][:/?#@\s]*)(:\d*)?", re.ASCII)
 # a clock set back by this much makes what was counted count for as long again: it is forgotten
 CLOCK_STEP_S = 1.0
 CORS_HEADERS = {
@@ -173,10 +176,10 @@ def is_own_name(host: str, hosts: Collection[str]) -> bool:
 
     That is an address, a name of one label, or one below a domain that the DNS at large does not have.
     """
-    try:
-        name = (urlsplit(f"//{host}").hostname or "").removesuffix(".")
-    except ValueError:
+    found = HOST.fullmatch(host)
+    if found is None:
         return False
+    name = found["name"].strip("[]").lower().removesuffix(".")
     if "." not in name or name.endswith(OWN_ENDS) or name in hosts:
         return True
     try:

@@ -118,6 +118,9 @@ def test_without_keys_another_site_s_page_changes_nothing(
         ("127.0.0.1.stranger.example:8000", False),
         ("127.0.0.1@stranger.example", False),
         ("stranger.example#.local", False),
+        ("localhost:1.stranger.example", False),
+        ("x@localhost", False),
+        ("localhost/stranger.example", False),
         ("[stranger.example", False),
     ],
 )
