@@ -53,10 +53,10 @@ class Exif:
     @property
     def focus_from_lens_m(self) -> float | None:
         """Where the lens was focused, if ``subject_distance_m`` counts from the sensor; None where none is so near."""
-        distance_m, focal_length_m = self.subject_distance_m, (self.focal_length_mm or math.inf) / 1e3
-        if distance_m is None or distance_m < 4 * focal_length_m:
+        distance_m, focal_length_mm = self.subject_distance_m, self.focal_length_mm
+        if distance_m is None or focal_length_mm is None or distance_m < 4 * focal_length_mm / 1e3:
             return None
-        return thin_lens.focus_from_lens(distance_m, focal_length_m)
+        return thin_lens.focus_from_lens(distance_m, focal_length_mm / 1e3)
 
 
 def read_exif(exif: bytes) -> Exif:

@@ -147,7 +147,7 @@ def _jpeg(data: bytes) -> Header:
 
 def _jpeg_quality(tables: bytes) -> float:
     """libjpeg's quality whose steps are as coarse in all as those of the first table, luminance's."""
-    steps = struct.unpack_from(">64H" if tables[0] >> 4 else ">64B", tables, 1)
+    steps: tuple[int, ...] = struct.unpack_from(">64H" if tables[0] >> 4 else ">64B", tables, 1)
     coarseness = sum(steps) / JPEG_STEPS_OF_50
     return 50 / coarseness if coarseness > 1 else 100 - 50 * coarseness
 

@@ -151,6 +151,7 @@ def test_a_portrait_mode_is_told_of() -> None:
         (0.6, 100.0, True),
         (2.35, 100.0, False),  # 2.24 m from the lens
         (math.inf, 35.0, True),
+        (math.inf, None, True),
     ],
 )
 def test_another_focus_than_the_camera_s_is_told_of_unless_it_came_with_the_photograph(
