@@ -298,10 +298,11 @@ class Estimator:
         camera, scale, ranges = reading.camera, reading.scale, self.manifest.ranges
         size = f" ({camera.image_width_px}x{camera.image_height_px})" if whole else ""
         told = [] if scale == 1 else [f"read at {scale:.3g} of full size{size}"]
-        # however large k_cam is, there is a copy that suits it
+        # however large k_cam is, there is a copy that suits it, and that of one is never sharper than its pixels
         k_cam_px = min(camera.k_cam_px, ranges.k_cam_px.high)
+        gamma_px = camera.gamma_px if scale == 1 else max(camera.gamma_px, ranges.gamma_px.low)
         told += _outside("k_cam_px at that size", k_cam_px, ranges.k_cam_px)
-        told += _outside("gamma_px at that size", camera.gamma_px, ranges.gamma_px)
+        told += _outside("gamma_px at that size", gamma_px, ranges.gamma_px)
         told += _outside("focus_distance_m", camera.focus_distance_m, ranges.focus_distance_m)
         if camera.intrinsics:
             told += _outside("fx_px at that size", camera.intrinsics.fx_px, ranges.focal_length_px)

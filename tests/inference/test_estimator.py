@@ -410,6 +410,19 @@ def test_what_lies_outside_the_trained_ranges_is_said(estimator: Estimator) -> N
         assert name in told
 
 
+def test_the_gamma_that_a_large_photograph_s_copy_has_is_no_warning(tmp_path: Path) -> None:
+    folder = load_model_folder(build_oracle_pair(tmp_path / "model", blur_range=Interval(0.3, 40.0)))
+    ranges = folder.manifest.ranges.model_copy(update={"gamma_px": Interval(0.3, 1.5)})
+    manifest = folder.manifest.model_copy(update={"ranges": ranges})
+    estimator = Estimator.from_folder(replace(folder, manifest=manifest))
+    large = Camera(1152, 768, 2.0, 300.0, 0.5)
+    answer = estimator.estimate(grey(brightness_for(8.0), 768, 1152), large, "near")
+    assert max(answer.scales) < 0.17  # of which gamma is hardly more than a pixel's box, 0.29
+    assert not [warning for warning in answer.warnings if "gamma_px" in warning]
+    (told,) = estimator.estimate(grey(60), replace(CAMERA, gamma_px=0.2), "near").warnings
+    assert "gamma_px at that size is 0.2" in told
+
+
 def test_an_answer_that_is_too_unsure_is_none(tmp_path: Path) -> None:
     unsure = Estimator.from_folder(load_model_folder(build_oracle_pair(tmp_path / "m", depth_scale=0.8)))
     answer = unsure.estimate(grey(60), CAMERA, "near")
