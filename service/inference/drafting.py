@@ -185,7 +185,8 @@ def _sensor_widths_mm(
             yield width_mm, ()
         else:
             warnings.append(f"its EXIF makes the sensor {width_mm:.3g} mm wide, which cannot be, and was not believed")
-    is_whole = any(math.isclose(max(aspect, 1 / aspect), known, rel_tol=ASPECT_TOLERANCE) for known in SENSOR_ASPECTS)
+    longer = max(aspect, 1 / aspect)
+    is_whole = any(math.isclose(longer, known, rel_tol=ASPECT_TOLERANCE) for known in SENSOR_ASPECTS)
     shape = () if is_whole else ("the picture is neither 4:3 nor 3:2: the sensor may be larger than the frame it took",)
     crops: list[tuple[float | None, str]] = [
         (
@@ -198,6 +199,8 @@ def _sensor_widths_mm(
             f"the sensor's size follows from the 35-mm equivalent, {exif.focal_length_35mm:g} mm for "
             f"{exif.focal_length_mm:g}, which is rounded: k_cam may be off by some percent"
         )
+        if exif.focal_length_35mm == exif.focal_length_mm and not math.isclose(longer, 3 / 2, rel_tol=ASPECT_TOLERANCE):
+            words += "; focal length and equivalent are the same: a phone's real focal length is a few millimetres"
         crops.append((exif.focal_length_35mm / exif.focal_length_mm / exif.zoom, words))
     for crop, words in crops:
         width_mm = FULL_FRAME_DIAGONAL_MM / (crop or math.inf) * aspect / math.hypot(aspect, 1)

@@ -142,6 +142,18 @@ def test_the_equivalent_tells_the_sensor_but_is_no_focal_length() -> None:
     assert said(alone, "lens.pixel_pitch_um is needed")
 
 
+@pytest.mark.parametrize(
+    ("size_px", "focal_length_mm", "is_told"),
+    [((4000, 3000), 26.0, True), ((3000, 4000), 26.0, True), ((6000, 4000), 26.0, False), ((4000, 3000), 6.8, False)],
+    ids=["phone", "held upright", "full frame", "real"],
+)
+def test_an_equivalent_that_stands_for_the_focal_length_is_told(
+    size_px: tuple[int, int], focal_length_mm: float, *, is_told: bool
+) -> None:
+    exif = Exif(focal_length_mm=focal_length_mm, focal_length_35mm=26.0, f_number=1.8)
+    assert said(draft_camera(exif, *size_px), "focal length and equivalent are the same") == is_told
+
+
 def test_a_digital_zoom_is_taken_out_of_the_equivalent_and_told() -> None:
     zoomed = draft(make="Nobody", model="Nothing 1", focal_length_35mm=104.0, digital_zoom=2.0)
     assert zoomed.lens.pixel_pitch_um == pytest.approx(6.05 / 2, rel=0.05)
