@@ -440,7 +440,7 @@ def data(
         from model_export.datasets import ddff12, defocusnet, nyu
         from model_export.datasets.photos import save_photos
 
-    shots = {"defocusnet": defocusnet.shots, "ddff12": ddff12.shots, "nyu": nyu.shots}[layout]
+    photos = {"defocusnet": defocusnet.photos, "ddff12": ddff12.photos, "nyu": nyu.photos}[layout]
     with progress_bar(Console(stderr=True)) as progress, _plain_failures():
-        written = save_photos(out, progress.track(shots(source), total=None, description=layout))
+        written = save_photos(out, progress.track(photos(source), total=None, description=layout))
     typer.echo(f"{out}: {written} pictures")

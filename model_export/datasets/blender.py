@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from model_export.datasets.photos import Photo, Shot, save_photos
+from model_export.datasets.photos import Photo, PhotoAndCamera, save_photos
 from model_export.render import DISC, blur
 from service.cores import available_cores
 from service.optics import thin_lens
@@ -224,7 +224,7 @@ def develop(rendered: Path, scenes: list[Scene], out: Path) -> None:
     save_photos(out, (_developed(rendered, scene) for scene in scenes))
 
 
-def _developed(rendered: Path, scene: Scene) -> Shot:
+def _developed(rendered: Path, scene: Scene) -> PhotoAndCamera:
     found = np.load(rendered / f"{scene.name}.npz")
     light = torch.from_numpy(found["light"].transpose(2, 0, 1).copy())
     margin = 8

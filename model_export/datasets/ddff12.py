@@ -11,7 +11,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from model_export.datasets.photos import Photo, Shot
+from model_export.datasets.photos import Photo, PhotoAndCamera
 
 FX_PX = 521.4052
 BASELINE_M = 1982.0250823695178 / 7317.020641763665 * 1e-3  # between neighbouring views
@@ -22,7 +22,7 @@ SPREAD = math.sqrt((VIEWS**2 - 1) / 12)
 GAMMA_PX = 0.5  # not known
 
 
-def shots(path: Path) -> Iterator[Shot]:
+def photos(path: Path) -> Iterator[PhotoAndCamera]:
     """Every picture of every stack of the validation set, or of the training set of a file without one.
 
     Raises ``ValueError`` for a file of another layout, ``OSError`` for one that is no HDF5.

@@ -8,7 +8,7 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
-from model_export.datasets.photos import Photo, Shot, read_image
+from model_export.datasets.photos import Photo, PhotoAndCamera, read_image
 from service.optics.camera import Lens
 
 FOCUS_DISTANCES_M = (0.1, 0.15, 0.3, 0.7, 1.5)
@@ -17,7 +17,7 @@ GAMMA_PX = 0.5  # taken for what Cycles' pixels blur
 PICTURE = re.compile(r"(.+)_(\d\d)All\.tif")
 
 
-def shots(folder: Path) -> Iterator[Shot]:
+def photos(folder: Path) -> Iterator[PhotoAndCamera]:
     """Every picture of every stack. Raises ``ValueError`` if there is none, or of another focus, ``OSError``."""
     pictures = [found for path in sorted(folder.glob("*All.tif")) if (found := PICTURE.fullmatch(path.name))]
     if not pictures:

@@ -6,13 +6,13 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from model_export.datasets.photos import Photo, Shot
+from model_export.datasets.photos import Photo, PhotoAndCamera
 
 FX_PX = 518.8579
 SEEN = (slice(45, 471), slice(41, 601))  # rows and columns that the depth camera saw, of 480 and 640
 
 
-def shots(path: Path) -> Iterator[Shot]:
+def photos(path: Path) -> Iterator[PhotoAndCamera]:
     """Every frame, its depth unknown where it was made up beyond what was seen.
 
     Raises ``ValueError`` for a file of another layout, ``OSError`` for one that is no HDF5.

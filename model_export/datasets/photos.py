@@ -24,7 +24,7 @@ class Photo:
     depth_m: NDArray[np.float32]
 
 
-Shot = tuple[Photo, Mapping[str, float]]  # and what is known of its camera, by the names of cameras.json
+PhotoAndCamera = tuple[Photo, Mapping[str, float]]  # what is known of the camera, by the names of cameras.json
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
@@ -57,12 +57,12 @@ def load_photos(folder: Path, every: int = 1) -> Iterator[Photo]:
         yield photo
 
 
-def save_photos(folder: Path, shots: Iterable[Shot]) -> int:
+def save_photos(folder: Path, photos: Iterable[PhotoAndCamera]) -> int:
     """Write pictures as a set, or into one: ``color/``, ``depth/`` and, last, ``cameras.json``; how many there were."""
     for part in ("color", "depth"):
         (folder / part).mkdir(parents=True, exist_ok=True)
     cameras = {}
-    for photo, camera in shots:
+    for photo, camera in photos:
         write_image(folder / "color" / f"{photo.name}.png", photo.image)
         write_depth(folder / "depth" / f"{photo.name}.png", photo.depth_m)
         cameras[photo.name] = dict(camera)

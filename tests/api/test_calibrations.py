@@ -19,7 +19,7 @@ from service.app import create_app
 from service.config import Settings
 from tests.fake_calibration import RESULT, SETTINGS, FakeCalibration, without_calibrations
 from tests.inference.photographs import corners, jpeg, png
-from tests.simulated_sheets import CAMERA, DEPTHS_M, GRID, shots
+from tests.simulated_sheets import CAMERA, DEPTHS_M, GRID, sheet_photos
 
 PROBLEM = "application/problem+json"
 PATIENCE_S = 15.0
@@ -491,7 +491,7 @@ def test_photographs_of_a_sheet_become_a_camera_that_depth_can_use(settings: Set
         "pattern": {"kind": GRID.kind, "rows": 7, "columns": 3, "spacing_mm": 26.0, "diameter_mm": 18.0},
         "register": True,
     }
-    parts = [picture(name=f"{name}.jpg", content=jpeg(rgb)) for name, _, rgb in shots(CAMERA, DEPTHS_M)]
+    parts = [picture(name=f"{name}.jpg", content=jpeg(rgb)) for name, _, rgb in sheet_photos(CAMERA, DEPTHS_M)]
     with TestClient(create_app(whole)) as client:
         response = send(client, settings_part(given), *parts, prefer="wait=60")
         assert response.status_code == 200, response.text

@@ -13,7 +13,7 @@ from starlette.testclient import TestClient
 from service.inference.images import TURNS
 from service.optics.camera import Camera, Intrinsics
 from tests.inference.photographs import corners, exif_of, jpeg, png, with_exif
-from tests.simulated_sheets import CAMERA, GRID, shots
+from tests.simulated_sheets import CAMERA, GRID, sheet_photos
 
 Z_M = 0.4
 AXIS: dict[str, Any] = {"fx_px": 900, "fy_px": 900, "cx_px": 400, "cy_px": 300, "distortion": [-0.05, 0.02, 0, 0, 0]}
@@ -29,7 +29,7 @@ KNOWN = {
 
 @pytest.fixture(scope="module")
 def sheet() -> NDArray[np.uint8]:
-    return shots(CAMERA, [Z_M])[0][2]
+    return sheet_photos(CAMERA, [Z_M])[0][2]
 
 
 def look(client: TestClient, data: bytes, **query: Any) -> Response:

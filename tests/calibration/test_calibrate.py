@@ -14,20 +14,20 @@ from service.calibration.report import PictureReport, Report
 from service.errors import InvalidImage
 from service.inference.cancellation import Cancelled
 from service.opencv import cv2
-from tests.simulated_sheets import CAMERA, DEPTHS_M, GRID, Shot, shots
+from tests.simulated_sheets import CAMERA, DEPTHS_M, GRID, SheetPhoto, sheet_photos
 
 
-def pictures(taken: Sequence[Shot]) -> list[Picture]:
+def pictures(taken: Sequence[SheetPhoto]) -> list[Picture]:
     return [picture(*shot) for shot in taken]
 
 
 @pytest.fixture(scope="module")
-def taken() -> list[Shot]:
-    return shots(CAMERA, DEPTHS_M)
+def taken() -> list[SheetPhoto]:
+    return sheet_photos(CAMERA, DEPTHS_M)
 
 
 @pytest.fixture(scope="module")
-def report(taken: list[Shot]) -> Report:
+def report(taken: list[SheetPhoto]) -> Report:
     return calibrate(Task(GRID), pictures(taken))
 
 
@@ -60,7 +60,7 @@ def test_the_plot_is_the_same_picture_every_time(report: Report) -> None:
     assert b"a$_{$.jpg" in as_svg(replace(report.result, samples=samples))
 
 
-def test_a_focus_distance_far_off_what_the_photographs_say_is_a_problem(taken: list[Shot]) -> None:
+def test_a_focus_distance_far_off_what_the_photographs_say_is_a_problem(taken: list[SheetPhoto]) -> None:
     report = calibrate(Task(GRID, 0.6), pictures(taken))
     assert report.result is None
     assert report.problem is not None
@@ -70,8 +70,8 @@ def test_a_focus_distance_far_off_what_the_photographs_say_is_a_problem(taken: l
 
 def test_pairs_as_in_the_paper_by_both_methods() -> None:
     """The slice of eq. 9 reads a third too much (its derivation: tests/calibration/test_edge.py)."""
-    focused = shots(CAMERA, (0.32, 0.3, 0.34, 0.31), "focused", seed=3)
-    both = pictures(focused + shots(CAMERA, (0.32, 0.3, 0.34, 0.31), seed=3))
+    focused = sheet_photos(CAMERA, (0.32, 0.3, 0.34, 0.31), "focused", seed=3)
+    both = pictures(focused + sheet_photos(CAMERA, (0.32, 0.3, 0.34, 0.31), seed=3))
     edge = calibrate(Task(GRID, 0.5), both).result
     paper = calibrate(Task(GRID, 0.5, "paper"), both).result
     assert edge is not None
@@ -83,15 +83,15 @@ def test_pairs_as_in_the_paper_by_both_methods() -> None:
 
 def test_a_partner_that_comes_later_serves_as_well() -> None:
     sheet = (0.3,)
-    blurred = shots(replace(CAMERA, k_cam_px=45.0), sheet, seed=3)  # its circles run into each other
-    focused = shots(replace(CAMERA, k_cam_px=1e-3), sheet, "focused", seed=3)
+    blurred = sheet_photos(replace(CAMERA, k_cam_px=45.0), sheet, seed=3)  # its circles run into each other
+    focused = sheet_photos(replace(CAMERA, k_cam_px=1e-3), sheet, "focused", seed=3)
     partner, found = calibrate(Task(GRID), pictures([*blurred, *focused])).pictures
     assert (partner.role, found.role) == ("focused", "defocused")
     assert "looked for the circles where its focused partner has them" in found.warnings
 
 
-def test_a_portrait_among_landscapes_is_turned(taken: list[Shot]) -> None:
-    turned: list[Shot] = [
+def test_a_portrait_among_landscapes_is_turned(taken: list[SheetPhoto]) -> None:
+    turned: list[SheetPhoto] = [
         (name, role, np.rot90(p, -1).copy() if i == 2 else p) for i, (name, role, p) in enumerate(taken)
     ]
     found = calibrate(Task(GRID), pictures(turned)).result
@@ -99,35 +99,35 @@ def test_a_portrait_among_landscapes_is_turned(taken: list[Shot]) -> None:
     assert found.k_cam_px.value == pytest.approx(4.0, rel=0.04)
 
 
-def test_all_in_focus_is_a_problem_and_no_k_cam(taken: list[Shot]) -> None:
+def test_all_in_focus_is_a_problem_and_no_k_cam(taken: list[SheetPhoto]) -> None:
     sharp = replace(CAMERA, k_cam_px=1e-3)
-    report = calibrate(Task(GRID), pictures(shots(sharp, (0.4, 0.5, 0.6, 0.7))))
+    report = calibrate(Task(GRID), pictures(sheet_photos(sharp, (0.4, 0.5, 0.6, 0.7))))
     assert report.result is None
     assert report.problem is not None
     assert "no circle is blurred" in report.problem
     assert calibrate(Task(GRID), pictures(taken[:1])).result is None
 
 
-def test_another_camera_among_them_is_left_out_or_warned_of(taken: list[Shot]) -> None:
+def test_another_camera_among_them_is_left_out_or_warned_of(taken: list[SheetPhoto]) -> None:
     other = replace(CAMERA, intrinsics=replace(CAMERA.intrinsics, fx_px=1400, fy_px=1400))
-    strange: list[Shot] = [("strange", role, pixels) for _, role, pixels in shots(other, (0.7,))]
+    strange: list[SheetPhoto] = [("strange", role, pixels) for _, role, pixels in sheet_photos(other, (0.7,))]
     report = calibrate(Task(GRID), pictures([*taken, *strange]))
     told = [*report.pictures[-1].warnings, *(report.result.warnings if report.result else ())]
     assert told
-    small: list[Shot] = [("small", "defocused", np.ascontiguousarray(taken[0][2][::2, ::2]))]
+    small: list[SheetPhoto] = [("small", "defocused", np.ascontiguousarray(taken[0][2][::2, ::2]))]
     report = calibrate(Task(GRID), pictures([*taken, *small]))
     assert "left out: 400x300 px, while most are 800x600" in report.pictures[-1].warnings
     assert report.result is not None
 
 
-def moved(shot: Shot) -> Shot:
+def moved(shot: SheetPhoto) -> SheetPhoto:
     """The photograph as it would be if the camera had moved along while it was taken."""
     name, role, pixels = shot
     return name, role, np.asarray(cv2.blur(pixels, (9, 1)), np.uint8)
 
 
-def test_one_that_moved_and_one_that_was_there_before_are_left_out(taken: list[Shot]) -> None:
-    again: Shot = ("again", "defocused", taken[4][2])
+def test_one_that_moved_and_one_that_was_there_before_are_left_out(taken: list[SheetPhoto]) -> None:
+    again: SheetPhoto = ("again", "defocused", taken[4][2])
     report = calibrate(Task(GRID), pictures([*taken[:2], moved(taken[2]), *taken[3:], again]))
     told = [picture.warnings for picture in report.pictures]
     assert [bool(words) for words in told] == [False, False, True, False, False, False, True]
@@ -140,17 +140,17 @@ def test_one_that_moved_and_one_that_was_there_before_are_left_out(taken: list[S
     assert {sample.image for sample in report.result.samples} == {taken[i][0] for i in (0, 1, 3, 4, 5)}
 
 
-def test_of_four_photographs_none_is_left_out_for_its_blur(taken: list[Shot]) -> None:
+def test_of_four_photographs_none_is_left_out_for_its_blur(taken: list[SheetPhoto]) -> None:
     report = calibrate(Task(GRID), pictures([taken[0], moved(taken[2]), *taken[4:]]))
     assert not any(words.startswith("left out") for picture in report.pictures for words in picture.warnings)
 
 
-def test_what_is_no_photograph_is_said_and_the_others_count(taken: list[Shot]) -> None:
+def test_what_is_no_photograph_is_said_and_the_others_count(taken: list[SheetPhoto]) -> None:
     def broken() -> NDArray[np.uint8]:
         raise InvalidImage("The file is empty.")
 
-    blank: list[Shot] = [("blank", "defocused", np.full((600, 800, 3), 90, np.uint8))]
-    bright: list[Shot] = [("bright", "defocused", np.minimum(taken[1][2].astype(int) * 2, 255).astype(np.uint8))]
+    blank: list[SheetPhoto] = [("blank", "defocused", np.full((600, 800, 3), 90, np.uint8))]
+    bright: list[SheetPhoto] = [("bright", "defocused", np.minimum(taken[1][2].astype(int) * 2, 255).astype(np.uint8))]
     report = calibrate(
         Task(GRID),
         [Picture("empty", "defocused", broken), *pictures(blank + bright + taken)],
@@ -163,7 +163,7 @@ def test_what_is_no_photograph_is_said_and_the_others_count(taken: list[Shot]) -
     assert "3 of 9 photographs were of no use" in report.result.warnings[0]
 
 
-def test_it_tells_how_far_it_is_and_can_be_stopped(taken: list[Shot]) -> None:
+def test_it_tells_how_far_it_is_and_can_be_stopped(taken: list[SheetPhoto]) -> None:
     told: list[tuple[float, tuple[PictureReport, ...]]] = []
     calls = 0
 

@@ -11,7 +11,7 @@ import cv2
 from playwright.sync_api import Browser, FilePayload, Page, expect
 
 from model_export.started_server import Server, serving
-from tests.simulated_sheets import CAMERA, DEPTHS_M, shots
+from tests.simulated_sheets import CAMERA, DEPTHS_M, sheet_photos
 from tests.web.chromium import running_browser
 from tests.web.steps import to_photographs
 from tests.web.watched import watched
@@ -114,7 +114,7 @@ def calibration(page: Page) -> None:
 @cache
 def simulated_photographs() -> list[FilePayload]:
     """Of a sheet before a lens of our own making."""
-    taken = zip(SHEET_DEPTHS_M, shots(CAMERA, SHEET_DEPTHS_M), strict=True)
+    taken = zip(SHEET_DEPTHS_M, sheet_photos(CAMERA, SHEET_DEPTHS_M), strict=True)
     return [
         {
             "name": f"at {depth_m:g} m.jpg",

@@ -14,7 +14,7 @@ from playwright.sync_api import Browser, Page, Route, expect
 
 from model_export.started_server import Server, serving
 from tests.inference.photographs import tiff
-from tests.simulated_sheets import CAMERA, DEPTHS_M, GRID, shots
+from tests.simulated_sheets import CAMERA, DEPTHS_M, GRID, sheet_photos
 from tests.web.steps import OVERFLOW, eventually, to_photographs
 from tests.web.watched import watched
 
@@ -37,7 +37,8 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Of the sheet, nearer and farther than focus, and one of nothing."""
     folder = tmp_path_factory.mktemp("photographs")
     taken = [
-        (f"at {z:g} m.jpg", rgb) for z, (_, _, rgb) in zip(DEPTHS_M[::2], shots(CAMERA, DEPTHS_M[::2]), strict=True)
+        (f"at {z:g} m.jpg", rgb)
+        for z, (_, _, rgb) in zip(DEPTHS_M[::2], sheet_photos(CAMERA, DEPTHS_M[::2]), strict=True)
     ]
     taken.append(("nothing.png", np.full((CAMERA.height_px, CAMERA.width_px, 3), 120, np.uint8)))
     for name, rgb in taken:
