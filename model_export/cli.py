@@ -378,13 +378,14 @@ def blender(
     """Ray-trace thin-lens scenes with exact depth, and compare our renderer's edges with Cycles'."""
     with _training_parts():
         from model_export.datasets import blender as cycles
+        from model_export.datasets import blender_environment
 
     edges, rooms = cycles.edges(), cycles.rooms(scenes)
     raw = out / "raw"
     try:
         with progress_bar(Console(stderr=True)) as progress:
             task = progress.add_task("Blender", total=None)
-            python = cycles.environment(environment)
+            python = blender_environment.environment(environment)
             progress.update(task, description="rendering", total=len(edges) + len(rooms))
             cycles.render(python, [*edges, *rooms], raw, lambda _: progress.advance(task))
     except (FileNotFoundError, RuntimeError) as exc:
@@ -413,13 +414,13 @@ def homes(
 ) -> None:
     """Ray-trace furnished rooms, sharp and with depth, to train on; stop and start it as you like."""
     with _training_parts():
+        from model_export.datasets import blender_environment
         from model_export.datasets import homes as furnished
-        from model_export.datasets.blender import environment as blender_environment
 
     try:
         with progress_bar(Console(stderr=True)) as progress:
             task = progress.add_task("Blender", total=None)
-            python = blender_environment(environment)
+            python = blender_environment.environment(environment)
             models = furnished.unpack(furniture, out / "models")
             due = furnished.due(out, rooms)
             progress.update(task, description="rendering", total=len(due) * furnished.VIEWS)

@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from model_export.datasets.blender import run_workers, shares
+from model_export.datasets.blender_environment import run_workers, shares
 from model_export.datasets.photos import CAMERAS, write_depth, write_image
 from model_export.textures import picture_files
 from service.optics.light import encode_srgb

@@ -15,12 +15,11 @@ from model_export.datasets.blender import (
     develop,
     edge_sigma,
     edges,
-    environment,
     render,
     rooms,
-    shares,
     sharp_edge,
 )
+from model_export.datasets.blender_environment import environment, shares
 from model_export.evaluation_sets import photographed_cases
 from service.cores import available_cores
 from service.optics import thin_lens
