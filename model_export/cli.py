@@ -199,7 +199,7 @@ def export(
     frames: Frames = None,
     name: Annotated[str | None, typer.Option(help="name of the model")] = None,
 ) -> None:
-    """Write a checkpoint as a model folder, and in it one in int8: two ONNX graphs, card and manifest each.
+    """Write a checkpoint as a model folder, and in it one in int8: graphs (ONNX), card and manifest each.
 
     A model folder is written anew, as what this version makes of its weights; its card says what they learned from.
     """
