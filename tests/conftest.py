@@ -1,6 +1,7 @@
 """What tests share: a real model folder, a scratch database made by the real migrations, the running app."""
 
 from collections.abc import Iterator
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -16,6 +17,7 @@ from service.storage import schema
 from service.storage.cameras import Cameras
 from service.storage.engine import open_engine
 from tests import postgres
+from tests.d200 import D200
 from tests.fake_calibration import FakeCalibration
 from tests.inference.oracle_pair import build_oracle_pair
 
@@ -116,15 +118,8 @@ def cameras(engine: Engine) -> Cameras:
 
 @pytest.fixture
 def d200() -> dict[str, Any]:
-    """A camera from lens specs, as a client sends it."""
-    return {
-        "name": "d200",
-        "image_width_px": 645,
-        "image_height_px": 432,
-        "focus_distance_m": 2.0,
-        "gamma_px": 0.5,
-        "lens": {"focal_length_mm": 35, "f_number": 2.8, "pixel_pitch_um": 6.05, "sensor_width_px": 3872},
-    }
+    """A camera from lens specs, as a client sends it; a test may change it."""
+    return deepcopy(D200)
 
 
 @pytest.fixture

@@ -24,19 +24,12 @@ from service.inference.estimator import Estimator
 from service.inference.pair import GraphPair, Side
 from service.opencv import cv2
 from service.optics.camera import Camera
+from tests.d200 import D200
 
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "coffee.jpg"
 MAX_BYTES = 12_000_000
 MAX_PEAK_BYTES = 600_000_000
 LARGE_PICTURES_BYTES = 150_000_000
-D200 = {
-    "name": "d200",
-    "image_width_px": 645,
-    "image_height_px": 432,
-    "focus_distance_m": 2.0,
-    "gamma_px": 0.5,
-    "lens": {"focal_length_mm": 35, "f_number": 2.8, "pixel_pitch_um": 6.05, "sensor_width_px": 3872},
-}
 REFERENCE = Camera(640, 480, 2.0, 3.81, 0.5)
 PLANES_M = (0.7, 1.0, 1.5)
 ABOUT = 0.3

@@ -11,6 +11,7 @@ import cv2
 from playwright.sync_api import Browser, FilePayload, Page, expect
 
 from model_export.started_server import Server, serving
+from tests.d200 import D200
 from tests.simulated_sheets import CAMERA, DEPTHS_M, sheet_photos
 from tests.web.chromium import running_browser
 from tests.web.steps import to_photographs
@@ -23,15 +24,6 @@ MOST_BYTES = 200_000
 JPEG_QUALITY = 85
 CALIBRATION_MS = 300_000
 SHEET_DEPTHS_M = DEPTHS_M[::2]
-D200 = {
-    "name": "d200",
-    "description": "Nikon D200, 35 mm at f/2.8, focused at 2 m",
-    "image_width_px": 645,
-    "image_height_px": 432,
-    "focus_distance_m": 2.0,
-    "gamma_px": 0.5,
-    "lens": {"focal_length_mm": 35, "f_number": 2.8, "pixel_pitch_um": 6.05, "sensor_width_px": 3872},
-}
 
 
 @dataclass(frozen=True)
@@ -141,7 +133,7 @@ PICTURES = (
 
 def prepare(server: Server) -> None:
     """What the pictures show: a camera, and some photographs answered."""
-    server.add(D200)
+    server.add(D200 | {"description": "Nikon D200, 35 mm at f/2.8, focused at 2 m"})
     for _ in range(4):
         server.ask("POST", "/depth?camera=d200", COFFEE.read_bytes(), {"Content-Type": "image/jpeg"})
 
