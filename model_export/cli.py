@@ -35,7 +35,7 @@ Teachers = Annotated[
     typer.Option(help="checkpoint or model folder to learn the answers of, too; of several their mean", exists=True),
 ]
 Seed = Annotated[int | None, typer.Option(min=0, max=MOST_SEED, help="the same seed is the same run", show_default="1")]
-Rate = Annotated[float | None, typer.Option(min=1e-6, max=1e-2, help="before it falls", show_default="0.001")]
+LearningRate = Annotated[float | None, typer.Option(min=1e-6, max=1e-2, help="before it falls", show_default="0.001")]
 Threads = Annotated[
     int | None,
     typer.Option(
@@ -51,8 +51,8 @@ Data = Annotated[
         exists=True,
     ),
 ]
-Layout = Literal["defocusnet", "ddff12", "nyu"]
-Checkpoint = Annotated[Path, typer.Option(help="checkpoint file of a run, or a model folder", exists=True)]
+Dataset = Literal["defocusnet", "ddff12", "nyu"]
+CheckpointPath = Annotated[Path, typer.Option(help="checkpoint file of a run, or a model folder", exists=True)]
 
 BLENDER_ENVIRONMENT = Path(".venv-blender")
 FILE_COLUMNS = 160
@@ -109,7 +109,7 @@ def train(
         bool, typer.Option("--fresh-decoders", help="of --weights the encoders alone: decoders and heads begin anew")
     ] = False,
     teacher: Teachers = None,
-    learning_rate: Rate = None,
+    learning_rate: LearningRate = None,
     setting: Annotated[
         list[str] | None,
         typer.Option(help="anything else of the run: decay_share=0.8, scenes.frame_share=0.5, scenes.k_cam_px=[1,20]"),
@@ -190,7 +190,7 @@ def average(
 
 @commands.command()
 def export(
-    checkpoint: Checkpoint,
+    checkpoint: CheckpointPath,
     out: Annotated[Path, typer.Option(help="model folder to write", file_okay=False)],
     textures: Annotated[
         Path | None,
@@ -233,7 +233,7 @@ def export(
 
 
 @commands.command()
-def verify(checkpoint: Checkpoint, model: Model = DEFAULT_MODEL) -> None:
+def verify(checkpoint: CheckpointPath, model: Model = DEFAULT_MODEL) -> None:
     """Compare torch with ONNX Runtime on three sizes; fails above 1e-3 relative."""
     with _training_parts():
         from model_export.verify import TOLERANCE, verify_checkpoint
@@ -432,7 +432,7 @@ def homes(
 
 @commands.command()
 def data(
-    layout: Annotated[Layout, typer.Argument(help="whose files they are")],
+    dataset: Annotated[Dataset, typer.Argument(help="whose files they are")],
     source: Annotated[Path, typer.Argument(help="folder of DefocusNet's, or the .h5 or .mat file", exists=True)],
     out: Annotated[Path, typer.Option(help="folder of the set, e.g. DATA/ddff12", file_okay=False)],
 ) -> None:
@@ -441,7 +441,7 @@ def data(
         from model_export.datasets import ddff12, defocusnet, nyu
         from model_export.datasets.photos import save_photos
 
-    photos = {"defocusnet": defocusnet.photos, "ddff12": ddff12.photos, "nyu": nyu.photos}[layout]
+    photos = {"defocusnet": defocusnet.photos, "ddff12": ddff12.photos, "nyu": nyu.photos}[dataset]
     with progress_bar(Console(stderr=True)) as progress, _plain_failures():
-        written = save_photos(out, progress.track(photos(source), total=None, description=layout))
+        written = save_photos(out, progress.track(photos(source), total=None, description=dataset))
     typer.echo(f"{out}: {written} pictures")

@@ -38,7 +38,7 @@ ENCODING = (cv2.IMWRITE_JPEG_QUALITY, 97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.
 
 
 @dataclass(frozen=True, slots=True)
-class Model:
+class Furniture:
     """A piece of furniture: an OBJ file, its width, depth and height, and at what height things stand on it."""
 
     path: str
@@ -46,7 +46,7 @@ class Model:
     top_m: float | None
 
 
-def unpack(libraries: Path, out: Path) -> list[Model]:
+def unpack(libraries: Path, out: Path) -> list[Furniture]:
     """The models of all ``*.sh3f`` files of a folder, unpacked; what stands on a floor and upright.
 
     Raises ``FileNotFoundError`` if there is no library.
@@ -63,7 +63,7 @@ def unpack(libraries: Path, out: Path) -> list[Model]:
     return found
 
 
-def _models(folder: Path) -> list[Model]:
+def _models(folder: Path) -> list[Furniture]:
     entries: dict[int, dict[str, str]] = defaultdict(dict)
     for line in (folder / CATALOGUE).read_text(encoding="latin-1").splitlines():
         if entry := ENTRY.match(line):
@@ -78,7 +78,7 @@ def _models(folder: Path) -> list[Model]:
         width, depth, height = (float(told[name]) * CENTIMETRE_M for name in ("width", "depth", "height"))
         if max(width, depth, height) <= LARGEST_M:
             top_m = float(told.get("dropOnTopElevation", 0)) * CENTIMETRE_M
-            found.append(Model(str(path), (width, depth, height), top_m if top_m > 0 else None))
+            found.append(Furniture(str(path), (width, depth, height), top_m if top_m > 0 else None))
     return found
 
 
@@ -109,7 +109,7 @@ def _known(out: Path) -> dict[str, dict[str, float] | None]:
 
 def render(
     python: Path,
-    models: list[Model],
+    models: list[Furniture],
     textures: Path,
     rooms: list[dict[str, object]],
     out: Path,

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from model_export.datasets.homes import SIZE_PX, VIEWS, Model, due, render, unpack
+from model_export.datasets.homes import SIZE_PX, VIEWS, Furniture, due, render, unpack
 from model_export.frames import load_frames
 
 ENTRY = {"name": "Table", "model": "/table/table.obj", "width": 120.0, "depth": 60.0, "height": 75.0}
@@ -73,7 +73,7 @@ def test_views_become_frames_and_are_not_rendered_again(tmp_path: Path, blender:
     textures, out, said = tmp_path / "textures", tmp_path / "out", list[str]()
     textures.mkdir()
     cv2.imwrite(str(textures / "grey.png"), np.full((4, 4, 3), 128, np.uint8))
-    model = Model("table.obj", (1.2, 0.6, 0.75), 0.7)
+    model = Furniture("table.obj", (1.2, 0.6, 0.75), 0.7)
     render(blender, [model], textures, due(out, 2), out, said.append)
     assert len(said) == 2 * VIEWS
     frames = load_frames(out)
