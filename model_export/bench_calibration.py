@@ -7,7 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from model_export.grids import GRID, SIZE_PX, GridCamera, draw_camera, draw_pose, photograph, picture, sweep
+from model_export.photographed_sheets import (
+    GRID,
+    SIZE_PX,
+    GridCamera,
+    draw_camera,
+    draw_pose,
+    photograph,
+    picture,
+    sweep,
+)
 from model_export.render import DISC
 from service.calibration.calibrate import Task, calibrate
 from service.calibration.fit import Interval

@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 
-from model_export.grids import GridCamera, sweep
+from model_export.photographed_sheets import GridCamera, sweep
 from service.calibration.calibrate import Task, calibrate
 from service.calibration.target import CircleGrid
 from service.optics.camera import Camera

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from model_export.grids import GridCamera, draw_pose, photograph
+from model_export.photographed_sheets import GridCamera, draw_pose, photograph
 from service.calibration.report import Role
 from service.calibration.target import CircleGrid
 from service.optics.camera import Intrinsics

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from model_export.grids import picture
+from model_export.photographed_sheets import picture
 from service.calibration.calibrate import Picture, Task, calibrate
 from service.calibration.plot import as_svg
 from service.calibration.report import PictureReport, Report

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from model_export.grids import GridCamera, draw_pose, photograph
+from model_export.photographed_sheets import GridCamera, draw_pose, photograph
 from service.calibration.look import MOST_MEASURED, look
 from service.calibration.measure import Measured, measure
 from service.calibration.report import PictureReport
