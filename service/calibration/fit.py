@@ -28,6 +28,7 @@ SHAPE_ERROR, PIXEL_ERROR_PX, FOCUS_ERROR = 0.003, 0.005, 5e-4  # of blur, gamma,
 CONFIDENCE = 0.95
 OUTLIER = 5.0
 LOOSE = 0.2
+BETTER = "lock the focus, and take more of them both nearer and farther than it"
 CHECKS = 40  # resamples for what the circles say of a focus distance that is given
 OFF, FAR_OFF = 1.02, 1.08  # of a focus distance that is given: from where it is warned of, and from where refused
 UNCHECKED = (
@@ -341,9 +342,9 @@ def _warnings(circles: Circles, found: tuple[Interval, Interval, Interval], *, i
         told.append(f"all circles are {side} the focus: photograph both sides, or give the focus distance")
     if max(k_cam.relative_width, focus.relative_width) > LOOSE:
         told.append(
-            "the pictures do not tell k_cam_px well: see its interval"
+            f"the pictures do not tell k_cam_px well, see its interval: {BETTER}"
             if is_focus_given
-            else "the pictures do not separate k_cam_px and focus_distance_m well: see their intervals"
+            else f"the pictures do not separate k_cam_px and focus_distance_m well, see their intervals: {BETTER}"
         )
     model = _model(np.array([k_cam.value, gamma.value, focus.value]), circles)
     off = float(np.median(np.abs(model / circles.blur_px - 1)))

@@ -198,3 +198,12 @@ def test_the_papers_k_cam_is_what_most_circles_tell(times: float) -> None:
     assert found.gamma_px.value == pytest.approx(GAMMA)
     with pytest.raises(FitError, match="focused and of defocused"):
         fit_as_paper(circles(BOTH_SIDES), FOCUS, depth_error=0.0, resamples=0)
+
+
+@pytest.mark.parametrize("given", [None, FOCUS])
+def test_pictures_that_were_each_focused_elsewhere_are_to_be_taken_with_the_focus_locked(given: float | None) -> None:
+    locked = circles(BOTH_SIDES)
+    elsewhere = np.array([1.1, 0.9, 1.1, 0.9, 1.1, 0.9, 1.1])[locked.picture]
+    moved = replace(locked, depth_m=locked.depth_m * elsewhere)
+    said = [" ".join(fit_constants(each, given, resamples=40).warnings) for each in (locked, moved)]
+    assert ["lock the focus" in words for words in said] == [False, True]
