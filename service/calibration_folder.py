@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import TypeAdapter
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -10,6 +12,7 @@ from rich.table import Table
 from service.calibration.calibrate import Picture, Task, calibrate
 from service.calibration.fit import Interval
 from service.calibration.report import PictureReport, Report, Role
+from service.errors import InvalidImage
 from service.file_names import name_column, shown
 from service.inference.images import SUFFIXES, ImageLimits, photographs_in, read_stored_frame
 
@@ -32,7 +35,16 @@ def pictures_in(folder: Path, limits: ImageLimits) -> list[Picture]:
 
 def _picture(path: Path, role: Role, limits: ImageLimits) -> Picture:
     name = f"{path.parent.name}/{path.name}" if path.parent.name == role else path.name
-    return Picture(shown(name), role, lambda: read_stored_frame(path.read_bytes(), limits))
+    return Picture(shown(name), role, lambda: _frame(path, limits))
+
+
+def _frame(path: Path, limits: ImageLimits) -> NDArray[np.uint8]:
+    """The photograph as the sensor had it. Raises ``InvalidImage`` for a file that cannot be read, too."""
+    try:
+        data = path.read_bytes()
+    except OSError as exc:
+        raise InvalidImage(f"The file cannot be read: {exc.strerror}.") from exc
+    return read_stored_frame(data, limits)
 
 
 def calibrate_folder(folder: Path, task: Task, limits: ImageLimits) -> Report:
