@@ -65,4 +65,5 @@ def in_metres(error: Array) -> Array:
     """
     variance = np.square(np.minimum(error, np.float32(ALL_IN_DOUBT)))
     variance *= (1 + variance) / ((1 - 2 * variance) * (1 - variance / 2))
-    return np.minimum(np.sqrt(variance), MOST_IN_METRES + (1 - MOST_IN_METRES) * error)
+    most: Array = MOST_IN_METRES + (1 - MOST_IN_METRES) * error
+    return np.minimum(np.sqrt(variance), most)

@@ -351,7 +351,7 @@ def test_a_kill_at_any_moment_of_a_restore_leaves_the_old_or_the_new(database: P
 def test_a_signal_to_end_leaves_no_half_copy(database: Path, copy: Path, command: str, number: signal.Signals) -> None:
     file = copy if command == "restore" else copy.with_name("another.sqlite3")
     environment = {**os.environ, "CAMIND_DATA_DIR": str(database.parent)}
-    arguments = [sys.executable, "-c", ENDED_COMMAND, str(int(number)), command, file]
+    arguments = [sys.executable, "-c", ENDED_COMMAND, str(int(number)), command, str(file)]
     assert subprocess.run(arguments, env=environment, check=False).returncode == 128 + number
     assert files_of(copy.parent) == {"data", copy.name}
     assert files_of(database.parent) == {database.name, f"{database.name}.lock"}
