@@ -4,7 +4,7 @@ import io
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from importlib.metadata import EntryPoint, entry_points, version
 from pathlib import Path
@@ -88,9 +88,10 @@ def serve(
             if settings.wants_keys:
                 _require_key(settings, engine)
     address = f"[{settings.host}]" if ":" in settings.host else settings.host
-    typer.echo(f"camind on http://{address}:{listener.getsockname()[1]}", err=True)
-    if not (settings.is_loopback or settings.wants_keys):
-        typer.echo("Other machines can reach it, and it asks nobody who they are.", err=True)
+    with suppress(OSError):  # a log's full disk is no reason not to serve
+        typer.echo(f"camind on http://{address}:{listener.getsockname()[1]}", err=True)
+        if not (settings.is_loopback or settings.wants_keys):
+            typer.echo("Other machines can reach it, and it asks nobody who they are.", err=True)
     if not server.serve(served, settings, listener):
         raise _failure("camind did not start: the log above says why.")
 

@@ -9,9 +9,10 @@ import sqlite3
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from urllib.parse import urlsplit
+from urllib.request import urlopen
 
 import pytest
 
@@ -119,6 +120,24 @@ def test_the_address_that_it_says_can_be_opened_in_ipv6_too(tmp_path: Path, tiny
             assert (told.scheme, told.hostname) == ("http", "::1")
             with socket.create_connection((told.hostname, told.port), timeout=10):
                 pass
+        finally:
+            process.kill()
+
+
+def test_a_log_without_room_hinders_neither_start_nor_end(tmp_path: Path, tiny_model_dir: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = str(free.getsockname()[1])
+    environment = {**os.environ, "CAMIND_DATA_DIR": str(tmp_path), "CAMIND_DRAIN_S": "0"}
+    command: list[str | Path] = [CAMIND, "serve", "--port", port, "--model", tiny_model_dir]
+    with Path("/dev/full").open("w") as full, subprocess.Popen(command, env=environment, stderr=full) as process:
+        try:
+            is_ready = False
+            while not is_ready and process.poll() is None:
+                time.sleep(0.05)
+                with suppress(OSError), urlopen(f"http://127.0.0.1:{port}/health/ready") as reply:
+                    is_ready = reply.status == 200
+            process.terminate()
+            assert (is_ready, process.wait(timeout=30)) == (True, 0)
         finally:
             process.kill()
 
