@@ -114,12 +114,11 @@ def back_up(
 
     Photographs that wait to be calibrated are not in it.
     """
-    from service.storage.backup import backup, using
+    from service.storage.backup import backup
 
     _end_in_order()
-    settings = _settings()
-    database = _database_file(settings)
-    with _plain_failures(), using(settings.effective_database_url):
+    database = _database_file(_settings())
+    with _plain_failures():
         contents = backup(database, file, is_forced=force)
     typer.echo(f"{file} holds {contents}")
 

@@ -53,6 +53,13 @@ def test_migrate_says_where_the_database_is(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout) == (0, f"The database is at {schema.head_revision()}.\n")
 
 
+def test_a_backup_of_nothing_says_where_it_looked_and_makes_nothing(tmp_path: Path) -> None:
+    done = camind(tmp_path / "absent", "backup", str(tmp_path / "copy"))
+    told = f"There is no database at {tmp_path / 'absent' / 'camind.sqlite3'}.\n"
+    assert (done.returncode, done.stderr) == (1, told)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_the_version_is_the_package_s(tmp_path: Path) -> None:
     assert camind(tmp_path, "version").stdout.strip() == version("camind")
 

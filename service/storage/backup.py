@@ -85,7 +85,8 @@ def require_sound(database: Path) -> None:
 def backup(database: Path, target: Path, *, is_forced: bool = False) -> Contents:
     """Copy the database as it is at one moment; services may go on writing to it.
 
-    Raises ``DatabaseFileError`` where there is none, where it is damaged, and where ``target`` is there already.
+    Raises ``DatabaseFileError`` where there is none, where it is damaged, and where ``target`` is there already;
+    ``NotReady`` while it is being restored.
     """
     if not database.is_file():
         raise DatabaseFileError(f"There is no database at {database}.")
@@ -93,7 +94,7 @@ def backup(database: Path, target: Path, *, is_forced: bool = False) -> Contents
         raise DatabaseFileError(f"{target} is the database itself: choose another name.")
     if target.exists() and not is_forced:
         raise DatabaseFileError(f"{target} is there already: choose another name, or overwrite it with --force.")
-    with _draft_beside(target) as draft:
+    with using(URL.create("sqlite", database=str(database))), _draft_beside(target) as draft:
         contents = _copied(database, draft, target)
         _put_in_place(draft, target)
     return contents
