@@ -120,12 +120,14 @@ def _id_in(folder: Path) -> str:
     path = folder / ID_FILE
     if not path.exists():
         draft = folder / f".{uuid4().hex}"
-        with draft.open("wb") as file:
-            file.write(uuid4().hex.encode())
-            write_through(file)
-        with suppress(FileExistsError):
-            path.hardlink_to(draft)
-        draft.unlink()
+        try:
+            with draft.open("wb") as file:
+                file.write(uuid4().hex.encode())
+                write_through(file)
+            with suppress(FileExistsError):
+                path.hardlink_to(draft)
+        finally:
+            draft.unlink(missing_ok=True)
         sync_folder(folder)
     return path.read_text()
 

@@ -1,6 +1,7 @@
 """The spool keeps photographs under names of its own, and is worked off by one process at a time."""
 
 import os
+import resource
 import time
 from pathlib import Path
 from uuid import uuid4
@@ -20,6 +21,17 @@ def test_a_spool_has_one_id_for_ever(spool: Spool, tmp_path: Path) -> None:
     assert Spool(tmp_path / "data" / "calibrations").id == spool.id
     assert Spool(tmp_path / "other").id != spool.id
     assert len(spool.id) == 32
+
+
+def test_a_start_without_room_leaves_no_file(tmp_path: Path) -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))
+    try:
+        with pytest.raises(OSError, match="too large"):
+            Spool(tmp_path / "calibrations")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list((tmp_path / "calibrations").iterdir()) == []
 
 
 def test_what_was_received_stays_until_it_is_removed(spool: Spool) -> None:
