@@ -120,6 +120,16 @@ def test_a_lens_that_tilts_loses_its_tilt_only_in_a_picture_that_is_turned() -> 
 def test_both_axes_follow_their_own_ratio() -> None:
     scaled = Intrinsics(500, 510, 319.5, 239.5).scaled(0.5, 0.25)
     assert (scaled.fx_px, scaled.fy_px) == (250, 127.5)
+    assert (scaled.cx_px, scaled.cy_px) == (159.5, 59.5)
+    assert (
+        Camera(640, 480, 2.0, 3.81, intrinsics=Intrinsics(500, 510, 319.5, 239.5)).resized(320, 120).intrinsics
+        == scaled
+    )
+
+
+def test_a_part_of_a_picture_is_seen_where_it_was() -> None:
+    part = Camera(640, 480, 2.0, 3.81, intrinsics=Intrinsics(500, 510, 300, 200)).cropped(100, 50, 320, 240)
+    assert part == Camera(320, 240, 2.0, 3.81, intrinsics=Intrinsics(500, 510, 200, 150))
 
 
 def test_a_range_never_begins_beyond_its_end() -> None:
@@ -130,3 +140,4 @@ def test_a_range_never_begins_beyond_its_end() -> None:
 def test_a_thumbnail_is_of_the_same_frame() -> None:
     frame = Camera(645, 432, 2.0, 1.53)
     assert frame.is_same_frame(16, 11)
+    assert frame.is_same_frame(20, 13)

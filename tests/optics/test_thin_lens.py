@@ -175,6 +175,13 @@ def test_gamma_before_averaging_is_that_of_which_it_comes(gamma_px: float) -> No
     assert thin_lens.gamma_after_averaging(before, 300, 200) == pytest.approx(gamma_px, rel=1e-9)
 
 
+@pytest.mark.parametrize("gamma_px", [0.0, 0.2])
+def test_no_copy_and_no_picture_is_sharper_than_a_pixels_box(gamma_px: float) -> None:
+    box_px = math.sqrt(thin_lens.PIXEL_BOX_VARIANCE)
+    assert thin_lens.gamma_after_averaging(gamma_px, 640, 320) == pytest.approx(box_px)
+    assert thin_lens.gamma_before_averaging(gamma_px, 640, 320) == pytest.approx(box_px)
+
+
 @pytest.mark.parametrize("blur_px", [0.5, 1.0, 4.0])
 def test_an_edge_is_as_steep_after_sharpening_as_one_of_the_blur_asked_for(blur_px: float) -> None:
     amount, spread_px = 0.4, 1.2
@@ -197,3 +204,14 @@ def test_gamma_of_a_smaller_picture_is_between_its_scaled_self_and_itself(gamma_
     assert gamma_px * ratio - 1e-9 <= small <= gamma_px + 1e-9
     assert small >= min(gamma_px, thin_lens.SHRUNK_GAMMA_PX) - 1e-9
     assert thin_lens.gamma_after_shrinking(gamma_px, 1) == pytest.approx(gamma_px)
+
+
+def test_softness_of_many_pixels_shrinks_with_the_picture() -> None:
+    assert thin_lens.gamma_after_shrinking(6.0, 0.5) == pytest.approx(3.0, rel=0.02)
+
+
+@pytest.mark.parametrize("blur_px", [3.0, 8.0])
+def test_far_from_gamma_the_spread_of_defocus_is_the_error_of_blur(blur_px: float) -> None:
+    k_cam_px, error = 4.0, 0.05
+    spread = thin_lens.relative_defocus_spread(blur_px, error, 0.3, k_cam_px)
+    assert spread == pytest.approx(error * blur_px / k_cam_px, rel=0.03)
