@@ -94,6 +94,7 @@ def test_paper_that_ends_beside_the_circle_is_said(right: int, bottom: int, sigm
         (np.zeros((SIZE, SIZE), np.float32), (64, 64, 24), "no light"),
         (np.random.default_rng(0).random((SIZE, SIZE)).astype(np.float32), (64, 64, 24), "does not look"),
         (circle(radius=11), (64, 64, 24), "another size"),
+        (circle(), (78, 64, 24), "not the circle that was looked for"),
     ],
 )
 def test_what_cannot_be_measured_is_said(

@@ -58,6 +58,33 @@ def test_the_camera_and_every_circle_s_depth_come_out() -> None:
     assert not found.warnings
 
 
+def test_a_sheet_s_distance_and_tilt_are_those_of_its_circles() -> None:
+    seen, depths = views(flat())
+    found = place(GRID, seen, SIZE)
+    assert found.distance_m == pytest.approx(DEPTHS_M, rel=3e-3)
+    for tilt_deg, depth_m in zip(found.tilt_deg, depths, strict=True):
+        across = np.column_stack([GRID.points_mm() / 1e3, np.ones(len(depth_m))])
+        per_metre = np.linalg.lstsq(across, depth_m)[0][:2]
+        assert np.sin(np.radians(tilt_deg)) == pytest.approx(np.hypot(*per_metre), rel=0.02)
+
+
+def test_circles_that_were_not_measured_are_not_missed() -> None:
+    seen, depths = views(flat())
+    measured = [np.flatnonzero(np.arange(len(depths[0])) % 5 != number % 5) for number in range(len(seen))]
+    parts = [View(part, view.centres_px[part]) for view, part in zip(seen, measured, strict=True)]
+    found = place(GRID, parts, SIZE)
+    assert found.intrinsics.fx_px == pytest.approx(1300, rel=3e-3)
+    for got, true, part in zip(found.depth_m, depths, measured, strict=True):
+        np.testing.assert_allclose(got, true[part], rtol=3e-3)
+
+
+def test_circles_that_are_seen_exactly_are_placed_exactly() -> None:
+    """The middle of a circle's image is not its centre's image."""
+    seen, depths = views(flat(), 4, noise_px=0.0)
+    for got, true in zip(place(GRID, seen, SIZE).depth_m, depths, strict=True):
+        np.testing.assert_allclose(got, true, rtol=1e-5)
+
+
 def test_depth_is_along_the_axis_and_not_along_the_ray() -> None:
     seen, depths = views(flat())
     found = place(GRID, seen, SIZE)
@@ -92,6 +119,14 @@ def test_few_views_and_no_tilt_are_said_and_one_view_is_an_error() -> None:
     assert any("3 usable photographs" in warning for warning in place(GRID, seen, SIZE).warnings)
     with pytest.raises(PoseError, match="1 photograph shows"):
         place(GRID, seen[:1], SIZE)
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_few_sheets_tell_the_focal_length_to_a_few_percent_with_the_axis_in_the_middle(count: int) -> None:
+    found = place(GRID, views(flat(), count)[0], SIZE).intrinsics
+    assert (found.fx_px, found.fy_px) == pytest.approx((1300, 1290), rel=0.04)
+    assert found.fx_px == found.fy_px
+    assert (found.cx_px, found.cy_px) == ((SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
 
 
 @pytest.mark.parametrize("tilted", [0.08, 0.15, 0.3])
