@@ -68,10 +68,43 @@ def test_the_exif_s_focal_length_will_do(client: TestClient, sheet: NDArray[np.u
     assert seen["distance_m"] == pytest.approx(Z_M, rel=0.03)
 
 
-@pytest.mark.parametrize(("gain", "exposure"), [(1.4, "over"), (0.25, "under")])
+def test_of_a_picture_made_small_the_exif_s_pixels_are_those_of_the_large_one(
+    client: TestClient, sheet: NDArray[np.uint8]
+) -> None:
+    # 9 mm on pixels of 5 um, 2000 to the centimetre: 1800 px of 1600
+    large: dict[int, Any] = {0x920A: (9, 1), 0xA20E: (2000, 1), 0xA210: 3, 0xA002: 1600, 0xA003: 1200}
+    seen = look(client, with_exif(jpeg(sheet), exif_of({}, large))).json()
+    assert seen["distance_m"] == pytest.approx(Z_M, rel=0.03)
+
+
+def test_a_lens_tells_the_focal_length_and_without_any_the_exif_may(
+    client: TestClient, sheet: NDArray[np.uint8]
+) -> None:
+    taken = with_exif(jpeg(sheet), exif_of({}, {0x920A: (9, 1), 0xA20E: (1000, 1), 0xA210: 3}))
+    lens = {"focal_length_mm": 9, "f_number": 2, "pixel_pitch_um": 10, "sensor_width_px": 800}
+    bare = {name: value for name, value in KNOWN.items() if name not in ("k_cam_px", "intrinsics")}
+    for change, source in (({"lens": lens}, "camera"), ({"k_cam_px": 4.0}, "exif")):
+        client.post("/cameras", json=bare | change | {"name": source})
+        seen = look(client, taken, camera=source).json()
+        assert seen["focal_length_from"] == source
+        assert seen["distance_m"] == pytest.approx(Z_M, rel=0.03)
+    blank = with_exif(jpeg(corners(200, 150)), exif_of({}, {0x920A: (9, 1), 0xA20E: (1000, 1), 0xA210: 3}))
+    seen = look(client, blank).json()
+    assert (seen["found"], seen["focal_length_from"]) == (False, None)
+
+
+@pytest.mark.parametrize(("gain", "exposure"), [(1.4, "over"), (0.5, "good"), (0.25, "under")])
 def test_exposure_is_told(client: TestClient, sheet: NDArray[np.uint8], gain: float, exposure: str) -> None:
     changed = np.clip(sheet * gain, 0, 255).astype(np.uint8)
     assert look(client, png(changed)).json()["exposure"] == exposure
+
+
+def test_white_that_is_clipped_in_a_part_of_the_sheet_is_over(client: TestClient, sheet: NDArray[np.uint8]) -> None:
+    changed = sheet.copy()
+    changed[:, 450:] = np.clip(1.4 * sheet[:, 450:], 0, 255)
+    seen = look(client, png(changed)).json()
+    assert seen["exposure"] == "over"
+    assert seen["paper_level"] < 0.98
 
 
 def test_a_photograph_without_the_sheet_says_so(client: TestClient) -> None:
