@@ -4,7 +4,7 @@ import json
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime, timedelta, timezone
 from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any
@@ -412,6 +412,9 @@ def test_keys_are_found_named_and_revoked(engine: Engine) -> None:
     assert keys.revoke(key.id).revoked_at == revoked.revoked_at
     assert keys.find(text) is None
     assert not keys.has_good()
+    tomorrow = datetime.now(timezone(timedelta(hours=5))) + timedelta(days=1)
+    keys.create("other", "lab", expires_at=tomorrow)
+    assert [(each.name, each.expires_at) for each in keys.every()] == [("robot", None), ("other", tomorrow)]
     with pytest.raises(NotFound):
         keys.revoke("0" * 12)
     for names in (("a b", "lab"), ("robot", "a b")):

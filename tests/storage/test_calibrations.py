@@ -76,6 +76,7 @@ def test_the_first_to_come_is_the_first_to_run(calibrations: Calibrations) -> No
     ids = [calibrations.add(draft()).id for _ in range(3)]
     calibrations.add(draft(OTHER_SPOOL))
     assert calibrations.waiting(SPOOL).total() == 3
+    assert calibrations.live_counts(SPOOL) == {"queued": 3, "running": 0}
     taken = [calibrations.take(SPOOL) for _ in range(4)]
     assert [record and record.id for record in taken] == [*ids, None]
     assert calibrations.waiting(SPOOL).total() == 0
@@ -156,6 +157,27 @@ def test_what_a_dead_process_left_is_tried_again(calibrations: Calibrations) -> 
     assert (again.id, again.attempts) == (calibration_id, 2)
 
 
+def test_what_is_tried_again_begins_anew_and_who_follows_it_is_told(calibrations: Calibrations, engine: Engine) -> None:
+    calibration_id = running(calibrations)
+    calibrations.tell(calibration_id, 0.5, [{"name": "near.jpg"}])
+    with writing(engine) as session:
+        session.connection().execute(update(CalibrationRow).values(updated_at=datetime.now(UTC) - timedelta(days=2)))
+    before = calibrations.version(calibration_id)
+    calibrations.recover(SPOOL)
+    calibrations.give_up(OTHER_SPOOL)
+    read = calibrations.get(calibration_id)
+    assert (read.state, read.progress, read.images) == ("queued", 0.0, [])
+    assert read.version > before
+
+
+def test_what_was_told_of_before_a_failure_stays(calibrations: Calibrations) -> None:
+    calibration_id = running(calibrations)
+    calibrations.tell(calibration_id, 0.5, [{"name": "near.jpg"}])
+    calibrations.finish(calibration_id, Ending("failed", problem="no grid"))
+    read = calibrations.get(calibration_id)
+    assert (read.problem, read.progress, read.images) == ("no grid", 0.5, [{"name": "near.jpg"}])
+
+
 def test_what_a_lost_service_held_fails_after_a_day(calibrations: Calibrations, engine: Engine) -> None:
     ids = [calibrations.add(draft()).id, running_elsewhere(calibrations).id]
     calibrations.give_up("c" * 32)
@@ -165,10 +187,13 @@ def test_what_a_lost_service_held_fails_after_a_day(calibrations: Calibrations, 
         session.connection().execute(update(CalibrationRow).values(updated_at=yesterday))
     calibrations.give_up(SPOOL)
     assert [calibrations.get(each).state for each in ids] == ["queued", "failed"]
+    before = calibrations.version(ids[0])
     calibrations.give_up("c" * 32)
+    assert calibrations.version(ids[0]) > before
     for each in ids:
         read = calibrations.get(each)
         assert read.state == "failed"
+        assert read.updated_at > yesterday + timedelta(hours=1)
         assert "did not come back" in (read.problem or "")
 
 
@@ -293,6 +318,20 @@ def test_an_unknown_id_is_not_found(calibrations: Calibrations, name: str) -> No
     for action in actions:
         with pytest.raises(NotFound):
             action()
+
+
+def test_another_owner_s_is_as_if_not_there(calibrations: Calibrations, engine: Engine) -> None:
+    calibration_id, others = running(calibrations), Calibrations(engine, "others")
+    actions: list[Callable[[], object]] = [
+        lambda: others.get(calibration_id),
+        lambda: others.cancel(calibration_id),
+        lambda: others.accept(calibration_id, "bench", CAMERA),
+    ]
+    for action in actions:
+        with pytest.raises(NotFound):
+            action()
+    assert others.page(9) == ([], False)
+    assert calibrations.get(calibration_id).state == "running"
 
 
 def test_accepted_by_many_at_once_it_is_stored_once(calibrations: Calibrations, engine: Engine) -> None:

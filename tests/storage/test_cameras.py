@@ -11,7 +11,7 @@ from sqlmodel import col, select
 
 from service.errors import Conflict, NotFound, PreconditionFailed
 from service.optics.camera import Camera, Intrinsics, Lens
-from service.storage.cameras import CameraDraft, Cameras
+from service.storage.cameras import CameraDraft, CameraRecord, Cameras
 from service.storage.engine import reading
 from service.storage.tables import CameraRevisionRow
 
@@ -61,8 +61,23 @@ def test_revisions_are_read_from_the_newest_down(cameras: Cameras) -> None:
     newest, has_more = cameras.revisions(DRAFT.name, 2)
     assert ([one.revision for one in newest], has_more) == ([3, 2], True)
     assert newest[0].camera == cameras.get(DRAFT.name).camera
+    assert newest[0].created_at > newest[1].created_at
     oldest, has_more = cameras.revisions(DRAFT.name, 2, before=2)
     assert ([one.draft for one in oldest], has_more) == ([DRAFT], False)
+
+
+def test_a_name_that_is_registered_anew_is_as_old_as_that(cameras: Cameras) -> None:
+    first = cameras.add(PLAIN)
+    ways: list[Callable[[], CameraRecord]] = [
+        lambda: cameras.add(PLAIN),
+        lambda: cameras.store_calibrated(PLAIN.name, PLAIN.camera),
+    ]
+    for register in ways:
+        cameras.delete(PLAIN.name)
+        again = register()
+        assert first.created_at < again.created_at == again.updated_at
+        assert cameras.get(PLAIN.name) == again
+        first = again
 
 
 def test_revisions_are_those_of_one_camera(cameras: Cameras) -> None:
