@@ -96,6 +96,16 @@ def damage(database: Path, page: int) -> None:
         file.write(b"\xa5" * (PAGE_BYTES // 2))
 
 
+def leave_journal(database: Path) -> None:
+    """A process that is killed while it writes."""
+    crash = (
+        "import os, sqlite3, sys; c = sqlite3.connect(sys.argv[1]); c.execute('PRAGMA cache_size = 1');"
+        "c.execute('UPDATE camera_revisions SET description = zeroblob(9000)'); os._exit(1)"
+    )
+    subprocess.run([sys.executable, "-c", crash, database], check=False)
+    assert (database.parent / f"{database.name}-journal").stat().st_size > 0
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with two databases, to be copied by every test: to make them takes a while."""
@@ -161,8 +171,10 @@ def test_a_backup_overwrites_only_by_force(database: Path, tmp_path: Path) -> No
     assert target.read_bytes() == b"mine"
     backup(database, target, is_forced=True)
     assert names_in(target) == OLD
-    with pytest.raises(DatabaseFileError, match="the database itself"):
-        backup(database, database, is_forced=True)
+    (tmp_path / "link").symlink_to(database)
+    for itself in (database, tmp_path / "link"):
+        with pytest.raises(DatabaseFileError, match="the database itself"):
+            backup(database, itself, is_forced=True)
 
 
 def test_a_target_without_room_is_named(database: Path, tmp_path: Path) -> None:
@@ -266,12 +278,7 @@ def test_a_damaged_database_is_replaced_and_kept(database: Path, copy: Path) -> 
 
 def test_a_journal_of_the_old_database_does_not_get_into_the_new_one(database: Path, copy: Path) -> None:
     """What a kill left beside the old file would be played back into whatever has its name."""
-    crash = (
-        "import os, sqlite3, sys; c = sqlite3.connect(sys.argv[1]); c.execute('PRAGMA cache_size = 1');"
-        "c.execute('UPDATE camera_revisions SET description = zeroblob(9000)'); os._exit(1)"
-    )
-    subprocess.run([sys.executable, "-c", crash, database], check=False)
-    assert (database.parent / f"{database.name}-journal").stat().st_size > 0
+    leave_journal(database)
     _, kept = restore(copy, database)
     assert kept is not None
     assert names_in(database) == ["new"]
@@ -279,7 +286,13 @@ def test_a_journal_of_the_old_database_does_not_get_into_the_new_one(database: P
     assert not [name for name in files_of(database.parent) if name.endswith("-journal")]
 
 
-@pytest.mark.parametrize("what", ["text", "empty", "foreign", "later", "damaged", "absent", "itself"])
+def test_a_journal_of_an_older_backup_does_not_get_into_the_new_one(database: Path, made: Path) -> None:
+    leave_journal(database)
+    backup(made / "new.sqlite3", database, is_forced=True)
+    assert names_in(database) == ["new"]
+
+
+@pytest.mark.parametrize("what", ["text", "empty", "foreign", "later", "damaged", "absent", "itself", "link"])
 def test_what_is_no_sound_backup_changes_nothing(database: Path, copy: Path, what: str) -> None:
     before = database.read_bytes()
     with closing(sqlite3.connect(copy)) as connection, connection:
@@ -291,8 +304,10 @@ def test_what_is_no_sound_backup_changes_nothing(database: Path, copy: Path, wha
         copy.write_bytes(b"no database, but long enough to be taken for one" * 100 if what == "text" else b"")
     if what == "damaged":
         damage(copy, 3)
-    if what == "absent":
+    if what in ("absent", "link"):
         copy.unlink()
+    if what == "link":
+        copy.symlink_to(database)
     with pytest.raises(DatabaseFileError, match="2999" if what == "later" else None):
         restore(database if what == "itself" else copy, database)
     assert database.read_bytes() == before
