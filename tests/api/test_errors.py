@@ -101,9 +101,13 @@ def test_what_is_wrong_with_the_whole_body_is_told_of_the_body(client: TestClien
     assert body["detail"] == detail
 
 
-@pytest.mark.parametrize("kind", ["text/plain", "image/jpeg", "multipart/form-data; boundary=x", "json", "text/json"])
-def test_another_content_type_is_unsupported(client: TestClient, kind: str) -> None:
-    answer = client.post("/cameras", content=b'{"name": "a"}', headers={"Content-Type": kind})
+@pytest.mark.parametrize(
+    "kind", ["text/plain", "image/jpeg", "multipart/form-data; boundary=x", "json", "text/json", "text/x+json", None]
+)
+def test_another_content_type_is_unsupported_and_so_is_none(
+    client: TestClient, phone: dict[str, Any], kind: str | None
+) -> None:
+    answer = client.post("/cameras", content=json.dumps(phone), headers={"Content-Type": kind} if kind else {})
     require_problem(answer, 415, "unsupported-kind")
 
 
