@@ -1,6 +1,7 @@
 """Our renderer against ray-traced thin-lens pictures, which ``camind blender`` made; Blender itself is not run here."""
 
 import json
+import math
 from pathlib import Path
 
 import cv2
@@ -23,6 +24,7 @@ from model_export.datasets.blender_environment import environment, shares
 from model_export.evaluation_sets import photographed_cases
 from service.cores import available_cores
 from service.optics import thin_lens
+from service.optics.light import decode_srgb
 
 RENDERS = Path(__file__).parent / "renders"
 KEPT = [scene for scene in edges() if (RENDERS / f"{scene.name}.png").exists()]
@@ -64,6 +66,9 @@ def test_rooms_become_a_set_with_their_cameras(tmp_path: Path) -> None:
     found = list(photographed_cases(tmp_path, 2))
     assert [case.name for case in found] == [scene.name for scene in scenes]
     for case, scene in zip(found, scenes, strict=True):
+        light = decode_srgb(np.asarray(case.image[..., 1] / 255, np.float32))
+        beyond_box_px = math.sqrt(GAMMA_PX**2 - thin_lens.PIXEL_BOX_VARIANCE)
+        assert edge_sigma(light, GAMMA_PX) == pytest.approx(beyond_box_px, rel=0.05)
         assert case.camera.gamma_px == GAMMA_PX
         assert case.camera.intrinsics is not None
         assert case.camera.intrinsics.fx_px == pytest.approx(scene.fx_px)

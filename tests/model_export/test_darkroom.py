@@ -93,6 +93,16 @@ def test_pictures_made_small_are_told_the_smaller_cameras_numbers() -> None:
     pytest.fail("none was made small")
 
 
+def test_in_a_picture_made_small_a_camera_blurs_less_and_is_no_sharper(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = []
+    for share in (0.0, 1.0):
+        monkeypatch.setattr("model_export.darkroom.RESCALED_SHARE", share)
+        told.append(photograph(np.random.default_rng(0), NEGATIVES, CONFIG, CPU)[2])
+    for whole, small in zip(*told, strict=True):
+        assert small.k_cam_px == pytest.approx(0.8 * whole.k_cam_px)
+        assert small.gamma_px > 0.999 * whole.gamma_px
+
+
 def test_the_same_seed_takes_the_same_pictures_another_takes_others() -> None:
     one, same, other = (collate_retaken(NEGATIVES, np.random.default_rng(seed), CONFIG, CPU) for seed in (1, 1, 2))
     assert torch.equal(one.image, same.image)

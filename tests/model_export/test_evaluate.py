@@ -22,6 +22,7 @@ from model_export.evaluation_sets import (
     Case,
     EvaluationSet,
     d200_cases,
+    enlarged_cases,
     evaluation_sets,
     procedural_cases,
     sharp_cases,
@@ -222,6 +223,31 @@ def test_the_certain_half_is_that_of_the_least_stated_error() -> None:
     assert pixels.error == pytest.approx([0, 0.1, 2, 1])
 
 
+def test_certainty_that_says_something_has_its_errors_in_order() -> None:
+    stated = np.linspace(0.01, 1, 100, dtype=np.float32)
+    pixels = Pixels(np.ones(100, np.float32), 1 + stated, stated)
+    assert pixels.order == pytest.approx(stated[:10].mean() / stated[50:].mean(), rel=1e-3)
+    (found,) = (row for row in blur_ranges("grey", pixels) if (row.low_px, row.high_px) == (1.0, 8.0))
+    assert (found.p90, found.order) == pytest.approx((0.9, pixels.order), rel=0.02)
+
+
+def test_sides_of_many_pixels_count_as_many() -> None:
+    joined = Sides.joined([Sides(1.0, 1.0, 300), Sides(0.0, 0.5, 100)])
+    assert joined == Sides(0.75, 0.875, 400)
+    assert Sides.joined([Sides(0.0, 0.0, 0)]) is None
+
+
+def test_a_model_s_scores_are_of_cameras_that_are_known_and_its_report_is_json(oracle: Examiner) -> None:
+    known = replace(case(1.0), blur_px=np.full((64, 96), blur_of(LEVEL), np.float32))
+    outcomes = [oracle.answer(known, mode)[0] for mode in ("gt", "k_cam +10%")]
+    sets = [summarise("desk", mode, [one]) for mode, one in zip(("gt", "k_cam +10%"), outcomes, strict=True)]
+    blur = outcomes[0].blur
+    assert blur is not None
+    report = Report("grey", sets, blur_ranges("desk", blur), {}, {})
+    assert report.scores()["desk.abs_rel"] == pytest.approx(0, abs=1e-3)
+    assert "Infinity" not in json.dumps(report.as_dict())
+
+
 def test_relief_is_what_of_the_differences_within_a_picture_is_answered() -> None:
     """Not what pictures differ by: one is twice as far as the other, and answered so."""
     truth = np.geomspace(0.5, 2, 101).astype(np.float32)
@@ -250,6 +276,15 @@ def test_intervals_hold_what_lies_within_them() -> None:
     pixels = Pixels(truth, np.ones(4, np.float32), np.full(4, 0.1, np.float32))
     assert pixels.within(1) == 0.5
     assert pixels.within(2) == 0.75
+
+
+def test_a_summary_tells_of_intervals_of_one_and_two_deviations_and_compares_no_few_pixels(oracle: Examiner) -> None:
+    truth, level = np.array([1.0, 1.05, 1.15, 1.5], np.float32), np.full(4, 1.5, np.float32)
+    few = Pixels(truth, np.ones(4, np.float32), np.full(4, 0.1, np.float32))
+    outcome = replace(oracle.answer(case(1.0))[0], depth=few, depth_blur_px=level, depth_defocus=level)
+    summary = summarise("few", "gt", [outcome])
+    assert summary.within == (0.5, 0.75)
+    assert set(summary.equal_blur.values()) == {None}
 
 
 def test_what_has_no_answer_is_in_no_interval() -> None:
@@ -316,6 +351,21 @@ def test_real_lenses_are_scored_away_from_steps(tmp_path: Path) -> None:
     assert not scored[:, 296:344].any()
     assert scored[:, :290].all()
     assert found.camera.k_cam_px == pytest.approx(1.5326 * 640 / 645, rel=1e-3)
+
+
+def test_real_lenses_are_scored_to_five_metres(tmp_path: Path) -> None:
+    write_photo(tmp_path, "one", 3000)
+    (found,) = d200_cases(tmp_path, 1)
+    assert np.nanmax(found.truth_m) == pytest.approx(3.0)
+
+
+def test_a_frame_made_larger_has_the_camera_of_its_size(tmp_path: Path) -> None:
+    write_photo(tmp_path, "one", 900)
+    (found,) = enlarged_cases(tmp_path, 1, REFERENCE, 2)
+    assert found.image.shape == (960, 1280, 3)
+    assert found.truth_m.shape == (found.camera.image_height_px, found.camera.image_width_px) == (960, 1280)
+    assert found.camera.k_cam_px == pytest.approx(2 * REFERENCE.k_cam_px)
+    assert found.truth_m[500, [100, 1200]] == pytest.approx([0.9, 1.8])
 
 
 def test_a_narrower_view_is_enlarged_and_blurs_alike(tmp_path: Path) -> None:

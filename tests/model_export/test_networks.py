@@ -2,15 +2,29 @@
 
 import copy
 import math
+from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
+from torch import nn
 from torch.nn import functional
 
 from model_export.batch_norms import folded
 from model_export.config import Kind, TrainConfig
-from model_export.losses import STANDING_OUT, Batch, correct, run_pair, standing_out, total_loss
-from model_export.networks import LUMINANCE, BandEnergy, Conditioning, Layout, Surroundings, make_pair, parameter_count
+from model_export.losses import STANDING_OUT, Batch, correct, laplace, run_pair, standing_out, total_loss
+from model_export.networks import (
+    LUMINANCE,
+    BandEnergy,
+    BlurEstimate,
+    Conditioning,
+    DepthEstimate,
+    Layout,
+    Pair,
+    Surroundings,
+    make_pair,
+    parameter_count,
+)
 from model_export.render import blur
 
 KINDS: list[Kind] = ["compact", "paper"]
@@ -96,6 +110,45 @@ def test_every_weight_learns_from_the_joint_loss(kind: Kind) -> None:
         assert torch.isfinite(weight.grad).all(), name
 
 
+class Knowing(nn.Module):
+    """A network with the same answer to everything."""
+
+    def __init__(self, answer: BlurEstimate | DepthEstimate) -> None:
+        super().__init__()
+        self.answer = answer
+
+    def forward(self, *_: Any) -> BlurEstimate | DepthEstimate:
+        return self.answer
+
+
+def test_who_answers_the_truth_on_its_side_is_off_by_nothing() -> None:
+    """Whatever is told of gamma, and whatever is answered of the other side of focus."""
+    seen = replace(batch(), told_gamma_px=torch.full((2,), 1.5))
+    log_ratio, none = -torch.log1p(seen.excess), torch.zeros_like(seen.excess)
+    near, far = (torch.where(side, log_ratio, log_ratio + 1) for side in (seen.excess > 0, seen.excess <= 0))
+    blur_px = torch.hypot(3.81 * seen.excess, torch.tensor(0.5))
+    depth = Knowing(DepthEstimate(near, far, 50 * seen.excess.sign(), none))
+    _, parts = total_loss(Pair("compact", Knowing(BlurEstimate(blur_px, none, ())), depth, 1), seen, TrainConfig())
+    assert [float(parts[name]) for name in ("blur", "depth", "side")] == pytest.approx([0, 0, 0], abs=1e-5)
+
+
+def test_the_scale_that_is_likeliest_is_the_mean_error() -> None:
+    error = torch.tensor([0.05, 0.1, 0.3, 0.15])
+    log_scale = torch.full((4,), math.log(0.15), requires_grad=True)
+    (slope,) = torch.autograd.grad(laplace(error, log_scale).sum(), log_scale)
+    assert float(slope.sum()) == pytest.approx(0, abs=1e-6)
+
+
+def test_networks_are_told_gamma_as_it_is_guessed() -> None:
+    pair, seen = make_pair("compact"), batch()
+    pair.modules().eval()
+    softer = torch.full((2,), 0.9)
+    guessed, other = replace(seen, told_gamma_px=softer), replace(seen, gamma_px=softer)
+    told = [run_pair(pair, one)[1].log_ratio_near for one in (seen, guessed, other)]
+    assert not torch.equal(told[0], told[1])
+    assert torch.equal(told[0], told[2])
+
+
 def test_what_is_unlike_its_surroundings_weighs_more() -> None:
     level = torch.zeros(1, 1, 96, 96)
     torch.testing.assert_close(standing_out(level), torch.ones_like(level))
@@ -108,12 +161,15 @@ def test_what_is_unlike_its_surroundings_weighs_more() -> None:
     torch.testing.assert_close(standing_out(post, 0.0), torch.ones_like(post))
 
 
-def test_b_weight_scales_the_blur_loss_alone() -> None:
+@pytest.mark.parametrize("name", ["b_weight", "side_weight"])
+def test_a_weight_scales_its_part_of_the_loss_alone(name: str) -> None:
     pair = make_pair("compact")
     pair.modules().eval()
+    configs: list[dict[str, Any]] = [{name: weight} for weight in (0.0, 1.0, 2.0)]
     with torch.no_grad():
-        zero, one, two = (float(total_loss(pair, batch(), TrainConfig(b_weight=w))[0]) for w in (0.0, 1.0, 2.0))
+        zero, one, two = (float(total_loss(pair, batch(), TrainConfig(**config))[0]) for config in configs)
     assert two - one == pytest.approx(one - zero, rel=1e-4)
+    assert one != zero
 
 
 def test_band_energies_fall_with_blur_finest_first() -> None:

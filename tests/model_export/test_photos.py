@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model_export.datasets.photos import Photo, load_photos, save_photos, write_image
+from model_export.datasets.photos import Photo, filled, load_photos, save_photos, write_image
 
 PICTURE = np.random.default_rng(1).integers(0, 256, (48, 64, 3), np.uint8)
 
@@ -25,6 +25,12 @@ def test_a_set_keeps_the_cameras_of_the_pictures_that_it_has(tmp_path: Path) -> 
     for name, fx_px in (("a", 500.0), ("b", 600.0)):
         save_photos(tmp_path, [(Photo(name, PICTURE, np.ones((48, 64), np.float32)), {"fx_px": fx_px})])
     assert json.loads((tmp_path / "cameras.json").read_text()) == {"a": {"fx_px": 500.0}, "b": {"fx_px": 600.0}}
+
+
+def test_what_is_unknown_is_as_far_as_the_nearest_that_is_known() -> None:
+    depth_m = np.full((5, 12), np.nan, np.float32)
+    depth_m[:, 2], depth_m[:, 3], depth_m[:, 10] = 1.0, 2.0, 3.0
+    np.testing.assert_array_equal(filled(depth_m), np.tile(np.repeat([1, 2, 3], (3, 4, 5)), (5, 1)).astype(np.float32))
 
 
 def test_depth_of_another_size_is_refused(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from model_export.render import (
     render_layers,
     sampled_taps,
 )
+from service.optics import thin_lens
 from service.optics.camera import Camera
 from service.optics.light import decode_srgb, encode_srgb
 
@@ -133,6 +134,16 @@ def test_in_focus_nothing_changes() -> None:
     image = rng.random((64, 64, 3)).astype(np.float32)
     picture = refocus(image, np.full((64, 64), 2.0, np.float32), Camera(64, 64, 2.0, 5.0, 0.0))
     np.testing.assert_allclose(picture, image, atol=2e-3)
+
+
+@pytest.mark.parametrize("gamma_px", [0.6, 1.2])
+def test_in_focus_an_edge_shows_gamma_of_which_the_pixels_box_is_a_part(gamma_px: float) -> None:
+    image = np.zeros((64, 64, 3), np.float32)
+    image[:, 32:] = 1
+    picture = refocus(image, np.full((64, 64), 2.0, np.float32), Camera(64, 64, 2.0, 5.0, gamma_px))
+    rise = np.diff(decode_srgb(picture)[32, :, 0])
+    beyond_box = float((rise * (np.arange(63) - 31) ** 2).sum() / rise.sum())
+    assert beyond_box + thin_lens.PIXEL_BOX_VARIANCE == pytest.approx(gamma_px**2, rel=0.02)
 
 
 def test_two_levels_of_blur_pass_for_the_one_between() -> None:
