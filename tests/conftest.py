@@ -8,6 +8,7 @@ from uuid import uuid4
 
 import pytest
 from fastapi import FastAPI
+from hypothesis import settings as hypothesis_settings
 from sqlalchemy import Engine, NullPool, create_engine
 from starlette.testclient import TestClient
 
@@ -20,6 +21,10 @@ from tests import postgres
 from tests.d200 import D200
 from tests.fake_calibration import FakeCalibration
 from tests.inference.oracle_pair import build_oracle_pair
+
+# how busy the machine is says nothing of what is tested
+hypothesis_settings.register_profile("unhurried", deadline=None)
+hypothesis_settings.load_profile("unhurried")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

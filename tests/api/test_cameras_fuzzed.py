@@ -39,7 +39,7 @@ def running(tmp_path_factory: pytest.TempPathFactory, tiny_model_dir: Path) -> I
         yield client
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(body=cameras)
 def test_any_camera_is_stored_or_refused(running: TestClient, body: dict[str, Any]) -> None:
     content = json.dumps(body)
@@ -55,7 +55,7 @@ def test_any_camera_is_stored_or_refused(running: TestClient, body: dict[str, An
     assert running.delete(location).status_code == 204
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(near=st.floats(), far=st.floats(), points=st.integers())
 def test_any_curve_is_drawn_or_refused(running: TestClient, near: float, far: float, points: int) -> None:
     body = {"name": "curved", "image_width_px": 4, "image_height_px": 3, "focus_distance_m": 1, "k_cam_px": 2}

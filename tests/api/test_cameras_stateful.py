@@ -171,7 +171,5 @@ def test_any_sequence_leaves_what_a_dictionary_holds(clients: list[TestClient], 
 
     run_state_machine_as_test(
         Machine,
-        settings=hypothesis_settings(
-            max_examples=300 if is_soak else 10, stateful_step_count=60 if is_soak else 20, deadline=None
-        ),
+        settings=hypothesis_settings(max_examples=300 if is_soak else 10, stateful_step_count=60 if is_soak else 20),
     )
