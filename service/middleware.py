@@ -163,7 +163,8 @@ class EndConnections:
         is_last = scope["http_version"] == "1.0" or "close" in headers.get("connection", "").lower()
         is_unclear = "transfer-encoding" in headers and "content-length" in headers
         is_waiting = headers.get("expect", "").lower() == "100-continue"
-        is_whole = is_answered = False
+        is_whole = "transfer-encoding" not in headers and "content-length" not in headers
+        is_answered = False
 
         async def followed() -> Message:
             nonlocal is_waiting, is_whole
@@ -177,8 +178,8 @@ class EndConnections:
             if message["type"] == "http.response.start" and (is_unclear or is_waiting):
                 is_last = True
                 MutableHeaders(scope=message)["Connection"] = "close"
-            elif message["type"] == "http.response.body" and is_last and not message.get("more_body", False):
-                is_answered = True
+            elif message["type"] == "http.response.body" and is_last and not is_whole:
+                is_answered = not message.get("more_body", False)
                 message = {**message, "more_body": True}
             await send(message)
 

@@ -107,6 +107,10 @@ def test_head_of_events_does_not_wait_for_the_end(server: Server) -> None:
     connection.request("GET", "/health/live")
     assert connection.getresponse().status == 200
     connection.close()
+    with server.connect() as last:
+        last.sendall(f"HEAD {path}/events HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n".encode())
+        while last.recv(4096):
+            pass
 
 
 def test_photographs_may_take_longer_than_other_bodies(server: Server) -> None:

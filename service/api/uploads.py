@@ -101,12 +101,13 @@ async def _from_form(request: Request, take: Callable[[int], None]) -> Upload:
     try:
         form = await parser.parse()
     except (MultiPartException, KeyError, ValueError) as exc:  # ValueError: of a charset that decodes nothing
-        detail = f"The form cannot be read ({exc}): send one file in the field '{FIELD}'."
+        detail = f"The form cannot be read ({exc}): send one file, with a file name, in the field '{FIELD}'."
         raise BadRequest.at(detail, f"#/{FIELD}") from exc
     try:
         file = form.get(FIELD)
         if not isinstance(file, UploadFile) or len(form.multi_items()) != 1:
-            raise BadRequest.at(f"Send one file in the field '{FIELD}', and no other field.", f"#/{FIELD}")
+            detail = f"Send one file, with a file name, in the field '{FIELD}', and no other field."
+            raise BadRequest.at(detail, f"#/{FIELD}")
         declared_kind(file.content_type)
         return Upload(await file.read(), file.content_type)
     finally:

@@ -185,7 +185,7 @@ class Calibrations:
         other = aliased(CalibrationRow)
         served_at = (
             select(func.max(other.updated_at))
-            .where(other.spool == spool, other.owner == CalibrationRow.owner, other.state != "queued")
+            .where(col(other.spool) == spool, col(other.owner) == CalibrationRow.owner, col(other.state) != "queued")
             .scalar_subquery()
         )
         query = (

@@ -18,7 +18,7 @@ from service.app import create_app
 from service.config import Settings
 from service.errors import Busy
 from service.inference.cancellation import Cancellation
-from service.inference.worker import Worker
+from service.inference.worker import Outcome, Worker
 from tests.fake_calibration import FakeCalibration, calibration_form
 from tests.inference.photographs import corners, png
 from tests.test_access import bearer
@@ -43,7 +43,7 @@ def taken(slots: int, queue_size: int, wanted: dict[str | None, int], release: t
     async def scenario() -> Counter[str | None]:
         counts: Counter[str | None] = Counter()
         worker = Worker(slots=slots, queue_size=queue_size, deadline_s=5)
-        begun = []
+        begun: list[asyncio.Task[Outcome[None]]] = []
         for owner, count in wanted.items():
             share = Share(worker, counts, owner)
             begun += [asyncio.create_task(share.run(hold, release)) for _ in range(count)]
