@@ -32,6 +32,6 @@ class Share:
             raise Busy(detail, retry_after_s=max(1, own))
         self.taken[self.owner] += 1
         try:
-            return await self.worker.run(work, *args, **kwargs)
+            return await self.worker.run_in_line(self.owner, work, *args, **kwargs)
         finally:
             self.taken[self.owner] -= 1

@@ -7,6 +7,7 @@ import asyncio
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -31,7 +32,9 @@ class Outcome(Generic[T]):
 
 
 class Worker:
-    """Runs functions that take a ``Cancellation`` first; made and closed with the app.
+    """Runs functions that take a ``Cancellation`` first, those of each line in their order, and the lines in turn.
+
+    Made and closed with the app.
 
     ``tell_wait`` is told the seconds each waited for its slot, from the slot's thread.
     """
@@ -48,6 +51,7 @@ class Worker:
         self._pool = ThreadPoolExecutor(max_workers=slots, thread_name_prefix="inference")
         self._lock = threading.Lock()
         self._live: set[Cancellation] = set()
+        self._lines: dict[str | None, deque[Callable[[], None]]] = {}
         self._typical_s = FIRST_GUESS_S
 
     @property
@@ -72,8 +76,14 @@ class Worker:
 
         Raises ``Busy`` when the queue is full or the deadline passes, and whatever the work raises.
         """
+        return await self.run_in_line(None, work, *args, **kwargs)
+
+    async def run_in_line(
+        self, line: str | None, work: Callable[Concatenate[Cancellation, P], T], *args: P.args, **kwargs: P.kwargs
+    ) -> Outcome[T]:
+        """As ``run``, in one of several lines."""
         cancellation = self._admit()
-        future = self._submit(cancellation, lambda: work(cancellation, *args, **kwargs))
+        future = self._submit(line, cancellation, lambda: work(cancellation, *args, **kwargs))
         try:
             async with asyncio.timeout(self.deadline_s) as deadline:
                 return await asyncio.wrap_future(future)
@@ -93,7 +103,7 @@ class Worker:
         """Ask everything to stop, and wait until it has."""
         for cancellation in tuple(self._live):
             cancellation.cancel()
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        self._pool.shutdown(wait=True)
 
     def _admit(self) -> Cancellation:
         cancellation = Cancellation()
@@ -106,8 +116,9 @@ class Worker:
             self._live.add(cancellation)
         return cancellation
 
-    def _submit(self, cancellation: Cancellation, work: Callable[[], T]) -> Future[Outcome[T]]:
+    def _submit(self, line: str | None, cancellation: Cancellation, work: Callable[[], T]) -> Future[Outcome[T]]:
         submitted = time.perf_counter()
+        future: Future[Outcome[T]] = Future()
 
         def timed() -> Outcome[T]:
             started = time.perf_counter()
@@ -117,13 +128,33 @@ class Worker:
             self._remember(time.perf_counter() - started)
             return Outcome(value, (started - submitted) * 1e3)
 
+        def settle() -> None:
+            if not future.set_running_or_notify_cancel():
+                return
+            try:
+                future.set_result(timed())
+            except BaseException as exc:
+                future.set_exception(exc)
+
+        future.add_done_callback(lambda _: self._live.discard(cancellation))
+        with self._lock:
+            self._lines.setdefault(line, deque()).append(settle)
         try:
-            future = self._pool.submit(timed)
+            self._pool.submit(self._work_next)
         except RuntimeError as exc:
             self._live.discard(cancellation)
             raise Busy("The service is stopping.") from exc
-        future.add_done_callback(lambda _: self._live.discard(cancellation))
         return future
+
+    def _work_next(self) -> None:
+        """The first of the next line, which then goes behind the others."""
+        with self._lock:
+            line = next(iter(self._lines))
+            waiting = self._lines.pop(line)
+            settle = waiting.popleft()
+            if waiting:
+                self._lines[line] = waiting
+        settle()
 
     def _remember(self, duration_s: float) -> None:
         self._typical_s = MEMORY_OF_DURATION * self._typical_s + (1 - MEMORY_OF_DURATION) * duration_s

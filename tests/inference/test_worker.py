@@ -131,6 +131,35 @@ def test_a_queued_request_that_is_cancelled_never_runs(release: threading.Event)
     asyncio.run(scenario())
 
 
+def test_lines_take_turns(release: threading.Event) -> None:
+    async def scenario() -> list[str]:
+        ran: list[str] = []
+        worker = Worker(slots=1, queue_size=9, deadline_s=5)
+        begun = [asyncio.create_task(worker.run(hold, release))]
+        for name in ("a1", "a2", "a3", "b1", "b2", "c1"):
+            await asyncio.sleep(0)
+            begun.append(asyncio.create_task(worker.run_in_line(name[0], lambda _, name=name: ran.append(name))))
+        await asyncio.sleep(0.02)
+        release.set()
+        await asyncio.gather(*begun)
+        worker.close()
+        return ran
+
+    assert asyncio.run(scenario()) == ["a1", "b1", "c1", "a2", "b2", "a3"]
+
+
+def test_closing_ends_those_that_wait() -> None:
+    async def scenario() -> None:
+        worker = Worker(slots=1, queue_size=1, deadline_s=5)
+        tasks = [asyncio.create_task(worker.run(obey)) for _ in range(2)]
+        await asyncio.sleep(0.02)
+        await asyncio.to_thread(worker.close)
+        for end in await asyncio.gather(*tasks, return_exceptions=True):
+            assert isinstance(end, Busy)
+
+    asyncio.run(scenario())
+
+
 def test_errors_of_the_work_come_through() -> None:
     def fail(_: Cancellation) -> None:
         raise TimeoutError("its own")
