@@ -61,8 +61,9 @@ export function ImportDialog({ file, onClose }) {
 					</button>`}
 					<button type="button" onClick=${() => dialog.current?.close()}>${stored > 0 ? "Close" : "Cancel"}</button>
 					<span role="status">
-						${!fault && steps === null && `Reading ${file.name} ...`}
-						${stored > 0 && !isBusy && `${counted(stored, "camera is", "cameras are")} stored, ${failed} refused`}
+						${steps
+							? wanted.length === 0 && `${counted(stored, "camera is", "cameras are")} stored, ${failed} refused`
+							: !fault && `Reading ${file.name} ...`}
 					</span>
 				</div>
 			</div>

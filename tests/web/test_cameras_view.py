@@ -359,6 +359,7 @@ def test_an_import_says_first_that_the_service_does_not_answer(
     page.route("**/cameras", lambda route: route.abort(), times=1)
     plan.get_by_role("button", name="Import 1 camera").click()
     expect(plan.get_by_role("row", name=phone["name"])).to_contain_text("refused The service does not answer. Check")
+    expect(plan.get_by_role("status")).to_have_text("0 cameras are stored, 1 refused")
 
 
 def test_a_file_that_is_none_is_refused(page: Page, tmp_path: Path) -> None:

@@ -219,6 +219,7 @@ def test_another_owners_key_brings_its_own_cameras(browser: Browser, keyed: Keye
         give_key(page, key)
         theirs = page.get_by_role("button", name="theirs")
         expect(theirs).to_be_visible()
+        expect(page.get_by_role("img", name="Blur against distance")).to_be_visible()
         keyed.keys.revoke(known.id)
         page.get_by_text("Revisions").click()
         give_key(page, keyed.key())
