@@ -126,6 +126,7 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 		setIsDrafting(false);
 		setFile(taken);
 		newest.current = taken;
+		running.current = null;
 		const isNewest = () => newest.current === taken;
 		const found = await readShown(taken, MOST_PX, async (shown) =>
 			isNewest() ? reader.ask("photograph", { file: shown, mostPx: MOST_PX }).catch(() => null) : null,
@@ -160,25 +161,25 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 		ahead.current = "";
 		if (isRead) return undefined;
 		const abort = new AbortController();
+		run(file, abort.signal, running.current ? SETTLED_MS : 0);
 		running.current = abort;
-		run(file, abort.signal);
 		return () => abort.abort();
 	}, [file, camera?.name, camera?.revision, side, focusM, known, attempt]);
 
-	/** @param {File} sent @param {AbortSignal} signal */
-	async function run(sent, signal) {
+	/** @param {File} sent @param {AbortSignal} signal @param {number} waitMs */
+	async function run(sent, signal, waitMs) {
 		const show = (/** @type {Phase | null} */ next) => signal.aborted || setPhase(next);
 		setProblem(null);
 		setFailure(null);
 		show({ step: "upload", fraction: 0 });
-		await new Promise((resolve) => setTimeout(resolve, SETTLED_MS)); // arrow keys choose what they pass
+		await new Promise((resolve) => setTimeout(resolve, waitMs)); // arrow keys pass by
 		if (signal.aborted) return;
 		announce("Sending the photograph.");
 		try {
 			const answer = await upload(depthPath({ ...ask, format: "npz" }), {
 				body: sent,
 				headers: { "Content-Type": mediaTypeOf(sent) },
-				// a Blob: the browser keeps it outside the page, and the worker takes the arrays out of it one by one
+				// a Blob: it stays outside the page, and the worker takes its arrays out one by one
 				responseType: "blob",
 				signal,
 				onProgress: (fraction) =>
@@ -369,7 +370,7 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 	`;
 }
 
-/** Photographs that are dropped anywhere on the view, or pasted. @param {boolean} shown @param {(files: FileList | null | undefined) => void} take */
+/** Photographs dropped on the view, or pasted. @param {boolean} shown @param {(files: FileList | null | undefined) => void} take */
 function useFilesFromOutside(shown, take) {
 	useEffect(() => {
 		if (!shown) return undefined;
@@ -481,12 +482,12 @@ function about(camera) {
 	return description ? `${description}. ${numbers}` : numbers;
 }
 
-/** @param {string} header `decode;dur=1.2, wait;dur=0.1` @returns {[string, number][]} */
+/** @param {string} header `decode;dur=1.2` @returns {[string, number][]} */
 function readTimings(header) {
 	return Array.from(header.matchAll(/([\w-]+);dur=([\d.]+)/g), ([, stage, ms]) => [stage, Number(ms)]);
 }
 
-/** @param {Problem} problem @returns {Problem} with the size that would do, where the picture has too many pixels */
+/** @param {Problem} problem @returns {Problem} with the size that would do, where it has too many pixels */
 function withSize(problem) {
 	const told = /(\d+)x(\d+) pixels, more than the (\d+) /.exec(problem.detail);
 	if (problem.status !== 413 || told === null) return problem;
