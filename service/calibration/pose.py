@@ -84,7 +84,6 @@ def place(grid: CircleGrid, views: Sequence[View], size_px: tuple[int, int]) -> 
     distances = [
         float((turn @ middle)[2] + shift[2, 0]) / 1e3 for turn, shift in zip(turns, solved.shifts, strict=True)
     ]
-    matrix = solved.matrix
     focal_error = _focal_error(board, views, solved)
     if focal_error > MOST_FOCAL_ERROR:
         raise PoseError(
@@ -92,13 +91,7 @@ def place(grid: CircleGrid, views: Sequence[View], size_px: tuple[int, int]) -> 
             "sheet by 15 to 25 degrees, this way and that"
         )
     return Placement(
-        Intrinsics(
-            float(matrix[0, 0]),
-            float(matrix[1, 1]),
-            float(matrix[0, 2]),
-            float(matrix[1, 2]),
-            tuple(solved.distortion.ravel().tolist()),
-        ),
+        Intrinsics(*solved.matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), tuple(solved.distortion.ravel().tolist())),
         tuple(depths),
         tuple(distances),
         tuple(tilts),
