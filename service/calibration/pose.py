@@ -84,6 +84,7 @@ def place(grid: CircleGrid, views: Sequence[View], size_px: tuple[int, int]) -> 
     distances = [
         float((turn @ middle)[2] + shift[2, 0]) / 1e3 for turn, shift in zip(turns, solved.shifts, strict=True)
     ]
+    fx_px, fy_px, cx_px, cy_px = solved.matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     focal_error = _focal_error(board, views, solved)
     if focal_error > MOST_FOCAL_ERROR:
         raise PoseError(
@@ -91,7 +92,7 @@ def place(grid: CircleGrid, views: Sequence[View], size_px: tuple[int, int]) -> 
             "sheet by 15 to 25 degrees, this way and that"
         )
     return Placement(
-        Intrinsics(*solved.matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), tuple(solved.distortion.ravel().tolist())),
+        Intrinsics(fx_px, fy_px, cx_px, cy_px, tuple(solved.distortion.ravel().tolist())),
         tuple(depths),
         tuple(distances),
         tuple(tilts),

@@ -431,8 +431,8 @@ def test_a_form_without_exactly_the_field_is_422(bench: TestClient, form: dict[s
 
 @pytest.mark.parametrize("size", [10, 1_500_000])
 def test_a_form_s_file_without_a_name_is_asked_for_one(bench: TestClient, size: int) -> None:
-    sent = {"files": {"image": (None, b"x" * size)}}
-    refused(bench.post("/depth?camera=bench", **sent), 422, "with a file name")
+    answer = bench.post("/depth?camera=bench", files={"image": (None, b"x" * size)})
+    refused(answer, 422, "with a file name")
 
 
 def test_a_form_of_the_wrong_kind_or_without_bytes_is_refused(bench: TestClient) -> None:
