@@ -1,6 +1,7 @@
 """The command ``camind``. Further commands come from packages that register in ``camind.commands``."""
 
 import io
+import os
 import signal
 import sys
 from collections.abc import Iterator
@@ -92,7 +93,9 @@ def serve(
         typer.echo(f"camind on http://{address}:{listener.getsockname()[1]}", err=True)
         if not (settings.is_loopback or settings.wants_keys):
             typer.echo("Other machines can reach it, and it asks nobody who they are.", err=True)
-    if not server.serve(served, settings, listener):
+    has_served = server.serve(served, settings, listener)
+    _drop_unwritten()
+    if not has_served:
         raise _failure("camind did not start: the log above says why.")
 
 
@@ -510,6 +513,14 @@ def _end_in_order() -> None:
     for number in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is signal.SIG_DFL:
             signal.signal(number, lambda number, _: sys.exit(128 + number))
+
+
+def _drop_unwritten() -> None:
+    """Let the log's last lines go where there is no room for them: Python would end as if the service had failed."""
+    try:
+        sys.stderr.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 
 
 def _settings(**overrides: object) -> Settings:
