@@ -46,12 +46,16 @@ def open_engine(database_url: str | URL) -> Engine:
 
 
 def _make_file_private(_dialect: object, _record: object, arguments: Sequence[str], _options: object) -> None:
-    """What SQLite would make for all to read is made for its owner alone; its journals get the same rights."""
+    """What SQLite would make for all to read is made for its owner alone; its journals get the same rights.
+
+    A file that is there is not opened: closing it would take the locks from under this process' other connections
+    (https://www.sqlite.org/howtocorrupt.html, 2.2).
+    """
     file = arguments[0]
     if not file.startswith((":memory:", "file:")):
         # SQLite says better why a file cannot be made
         with suppress(OSError):
-            os.close(os.open(file, os.O_RDONLY | os.O_CREAT, 0o600))
+            os.close(os.open(file, os.O_RDONLY | os.O_CREAT | os.O_EXCL, 0o600))
 
 
 def _open_postgresql(url: URL) -> Engine:

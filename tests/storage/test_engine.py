@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -64,6 +66,19 @@ def test_what_is_stored_is_for_its_owner_alone(tmp_path: Path) -> None:
     private, kept = (folder.stat().st_mode & 0o777 for folder in (tmp_path / "new", open_folder))
     assert received == 0o700
     assert (private, kept, (open_folder / "calibrations").stat().st_mode & 0o777) == (0o700, 0o777, 0o700)
+
+
+def test_another_connection_leaves_a_writer_its_lock(tmp_path: Path) -> None:
+    file = tmp_path / "a.sqlite3"
+    engine = open_engine(f"sqlite:///{file}")
+    schema.upgrade(engine)
+    other_process = "import sqlite3, sys; sqlite3.connect(sys.argv[1], timeout=0).execute('BEGIN IMMEDIATE')"
+    with writing(engine) as session:
+        session.connection()
+        with engine.connect():
+            pass
+        ended = subprocess.run([sys.executable, "-c", other_process, file], capture_output=True, check=False)
+    assert b"database is locked" in ended.stderr
 
 
 def test_the_write_ahead_log_waits_for_a_sound_sqlite() -> None:
