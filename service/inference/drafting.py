@@ -13,9 +13,9 @@ from functools import lru_cache
 import lensfunpy
 
 from service.inference.exif import FULL_FRAME_DIAGONAL_MM, Exif
+from service.optics.camera import FOCUS_DISTANCES_M
 
 SENSOR_WIDTHS_MM = (1.0, 70.0)
-FOCUS_DISTANCES_M = (0.001, 100_000.0)
 # of the long side to the short one; others are cut out of one of these
 SENSOR_ASPECTS = (4 / 3, 3 / 2)
 ASPECT_TOLERANCE = 0.02

@@ -7,12 +7,11 @@ from service.errors import ImageSizeMismatch
 from service.inference.exif import FULL_FRAME_DIAGONAL_MM, Exif
 from service.inference.images import TURNS, UNTURNS, Photograph
 from service.optics import thin_lens
-from service.optics.camera import Camera, Lens
+from service.optics.camera import FOCUS_DISTANCES_M, Camera, Lens
 
 LENS_TOLERANCE = 0.05
 FOCUS_TOLERANCE = 0.15
 AS_INFINITY_M = 50.0  # from where on no ring has a figure but that of infinity
-INFINITY_M = 100_000.0  # the farthest that can be told
 SENSOR_WIDTHS_MM = (0.5, 100.0)  # an endoscope's, and more than a digital back's
 VIEW_TOLERANCE = 1.05
 SAME_VIEW = 1.25  # equivalents are rounded, and count the whole of a sensor that 16:9 or a square is cut out of
@@ -34,7 +33,7 @@ def camera_of(photograph: Photograph, camera: Camera) -> tuple[Camera, tuple[str
     A camera is registered with the size of its files or with that of its upright pictures. Raises
     ``ImageSizeMismatch`` for a picture that is not the whole frame.
     """
-    unlikely = tuple(_no_ring_s_figure(camera.focus_distance_m))
+    unlikely = tuple(_all_but_infinite(camera.focus_distance_m))
     width_px, height_px = photograph.width_px, photograph.height_px
     turned = camera.turned(*TURNS[photograph.orientation])
     fitting = next((one for one in (turned, camera) if one.is_same_frame(width_px, height_px)), None)
@@ -60,11 +59,12 @@ def camera_of(photograph: Photograph, camera: Camera) -> tuple[Camera, tuple[str
     return resized, (*unlikely, warning)
 
 
-def _no_ring_s_figure(focus_distance_m: float) -> Iterator[str]:
+def _all_but_infinite(focus_distance_m: float) -> Iterator[str]:
     """A warning of a distance that is as good as infinity, and may be one in millimetres or centimetres."""
-    if AS_INFINITY_M <= focus_distance_m < INFINITY_M:
+    farthest_m = FOCUS_DISTANCES_M[1]
+    if AS_INFINITY_M <= focus_distance_m < farthest_m:
         yield (
-            f"focused at {focus_distance_m:.6g} m, which is all but infinity: it counts in metres, and {INFINITY_M:g} "
+            f"focused at {focus_distance_m:.6g} m, which is all but infinity: it counts in metres, and {farthest_m:g} "
             "stands for infinity"
         )
 

@@ -9,6 +9,7 @@ from service.optics import thin_lens
 RANGE_BLUR_ERROR_PX = 0.25
 RANGE_DEPTH_ERROR = 0.1
 ASPECT_TOLERANCE = 0.01
+FOCUS_DISTANCES_M = (0.001, 100_000.0)  # that can be told; the farthest stands for infinity
 
 
 @dataclass(frozen=True, slots=True)
