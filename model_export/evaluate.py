@@ -36,6 +36,7 @@ from service.inference.estimator import Estimator
 from service.inference.hypotheses import SIGMA_OF_LAPLACE
 from service.inference.known import KnownDepth
 from service.inference.pair import GraphPair, RawMaps, Sights
+from service.inference.resampling import Lines
 from service.optics import thin_lens
 from service.optics.camera import Camera
 
@@ -82,11 +83,11 @@ class Examiner:
         near, far = (self._estimator.estimate(case.image, case.camera, side) for side in ("near", "far"))
         is_near = case.truth_m < case.camera.focus_distance_m
 
-        def layers() -> Layers:
+        def layers_at(lines: Lines) -> Layers:
             both = [(getattr(near, name), getattr(far, name)) for name in Layers.__slots__]
-            return Layers(*(np.where(is_near, *sides) for sides in both))
+            return Layers(*(lines.of(np.where(is_near, *sides)) for sides in both))
 
-        return replace(far, depth_m=np.where(is_near, near.depth_m, far.depth_m), layers=layers)
+        return replace(far, depth_m=np.where(is_near, near.depth_m, far.depth_m), layers_at=layers_at)
 
     def _scored(self, case: Case, told: DepthMap, blur: Pixels | None = None) -> tuple[Outcome, Example]:
         scored = np.flatnonzero(np.isfinite(case.truth_m))

@@ -276,6 +276,7 @@ def depth(
     ] = None,
     known: Annotated[list[str] | None, typer.Option(help="Known depth u,v,depth_m; may be repeated")] = None,
     roi: Annotated[str | None, typer.Option(help="Part u0,v0,u1,v1 to answer alone")] = None,
+    longest_px: Annotated[int | None, typer.Option(help="Longer side of the map at most. [default: full size]")] = None,
     only_missing: Annotated[bool, typer.Option("--only-missing", help="Leave out what is there already")] = False,
     model: Annotated[Path | None, typer.Option(help="Model folder. [default: the shipped model]")] = None,
     owner: Owner = LOCAL,
@@ -290,7 +291,7 @@ def depth(
         from service.inference.images import ImageLimits
 
     lists = {"at": at or (), "maps": maps or (), "known": known or ()}
-    asked = {"side": side, "focus_distance_m": focus_distance_m, "roi": roi, **lists}
+    asked = {"side": side, "focus_distance_m": focus_distance_m, "roi": roi, "longest_px": longest_px, **lists}
     try:
         query = query_of(camera, asked, formats)
         with _plain_failures():

@@ -82,6 +82,12 @@ class DepthQuery(BaseModel):
         Corners | None,
         Field(description="Part u0,v0,u1,v1 of the upright photograph to answer alone; u1 and v1 lie outside it"),
     ] = None
+    longest_px: Annotated[
+        int | None,
+        Field(
+            ge=16, le=100_000, description="Longer side of the map at most; it is never enlarged. Without it full size"
+        ),
+    ] = None
     focus_distance_m: Annotated[
         float | None,
         Field(ge=0.001, le=100_000, allow_inf_nan=False, description="This shot's focus distance, if not the camera's"),

@@ -81,13 +81,15 @@ def fulfil(cancellation: Cancellation, order: Order, estimator: Estimator) -> An
     depth_map = estimator.estimate(photograph.rgb, camera, order.query.side, cancellation, order.query.part, known)
     stopwatch.add(depth_map.timings_ms)
     warnings = (*order.warnings, *photograph.warnings, *taken, *shown, *seen, *resized, *depth_map.warnings)
-    origin = _origin_of(order, estimator.manifest.name, depth_map.camera, warnings)
+    origin = _origin_of(order, whole, estimator.manifest.name, depth_map.camera, warnings)
     beside = Beside(part.of(photograph.rgb), order.query.maps or MAPS, origin)
+    longest_px = order.query.longest_px
     with stopwatch.stage("encode"):
+        shrunk = depth_map if longest_px is None else depth_map.shrunk(longest_px)
         encoded = tuple(
             _as_json(depth_map, order, part, estimator.manifest.name, warnings)
             if wanted == JSON
-            else ENCODERS[wanted](depth_map, beside)
+            else ENCODERS[wanted](shrunk, beside)
             for wanted in order.formats
         )
     lost = (words for one in encoded for words in one.warnings)
@@ -109,12 +111,14 @@ def _as_json(depth_map: DepthMap, order: Order, part: Part, model: str, warnings
     return Encoded(read.model_dump_json().encode(), FORMAT_TYPES[JSON])
 
 
-def _origin_of(order: Order, model: str, used: Camera, warnings: Sequence[str]) -> dict[str, object]:
-    """What makes an answer what it is, but for the photograph; ``used`` is the camera it is by."""
+def _origin_of(order: Order, whole: Part, model: str, used: Camera, warnings: Sequence[str]) -> dict[str, object]:
+    """What makes an answer what it is, but for the photograph, whose size it has; ``used`` is the camera it is by."""
     return {
         "camera": order.record.name,
         "revision": order.record.revision,
         "model": model,
+        "image_width_px": whole.width_px,
+        "image_height_px": whole.height_px,
         "side": order.query.side,
         "focus_distance_m": used.focus_distance_m,
         "roi": order.query.roi,

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -12,7 +12,7 @@ from service.inference.artifact import Manifest
 from service.inference.hypotheses import SIGMA_OF_LAPLACE, in_metres, merged
 from service.inference.pair import RawMaps, Side
 from service.inference.part import Part
-from service.inference.resampling import Ratio, bands, sample
+from service.inference.resampling import Lines, Ratio, bands, sample, shrunk_size
 from service.opencv import exp
 from service.optics import thin_lens
 from service.optics.camera import Camera
@@ -140,44 +140,44 @@ class Layers:
     sigma_m: Array
     blur_px: Array
 
-    def cut(self, part: Part) -> "Layers":
-        """A part of all layers, not copied."""
-        return Layers(*(part.of(getattr(self, name)) for name in self.__slots__))
 
-
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class DepthMap:
     """Maps [height, width] of the upright photograph, in metres along the optical axis if not said otherwise.
 
     ``depth_m`` and ``sigma_m`` are NaN where there is no answer (``valid`` is false), ``depth_alt_m`` there
     and where no other hypothesis exists. ``p_near`` is 0..1; ``blur_px`` is in pixels of the photograph.
-    Maps but ``depth_m`` are in ``layers``, made when first asked for: most answers need none of them.
+    Maps but ``depth_m`` come from ``layers_at`` some lines, when first asked for: most answers need none of them.
     ``camera`` is the one used, at the photograph's size; ``scales`` are the copies read, 1 being full size.
     """
 
     depth_m: Array
     valid: NDArray[np.bool_]
-    layers: Callable[[], Layers]
+    layers_at: Callable[[Lines], Layers]
     camera: Camera
     scales: tuple[float, ...]
     warnings: tuple[str, ...]
     timings_ms: Mapping[str, float]
 
+    @cached_property
+    def _layers(self) -> Layers:
+        return self.layers_at(Lines.between(0, self.height_px, 0, self.width_px))
+
     @property
     def depth_alt_m(self) -> Array:
-        return self.layers().depth_alt_m
+        return self._layers.depth_alt_m
 
     @property
     def p_near(self) -> Array:
-        return self.layers().p_near
+        return self._layers.p_near
 
     @property
     def sigma_m(self) -> Array:
-        return self.layers().sigma_m
+        return self._layers.sigma_m
 
     @property
     def blur_px(self) -> Array:
-        return self.layers().blur_px
+        return self._layers.blur_px
 
     @property
     def width_px(self) -> int:
@@ -189,12 +189,31 @@ class DepthMap:
 
     def cut(self, part: Part) -> "DepthMap":
         """The maps of a part alone, with the camera behind it."""
+        lines = Lines.between(part.top, part.bottom, part.left, part.right)
+        maps = part.of(self.depth_m), part.of(self.valid)
+        return self._at(lines, maps, part.behind(self.camera))
+
+    def shrunk(self, longest_px: int) -> "DepthMap":
+        """Of larger maps those pixels in which a smaller copy's have their centres, with the camera behind the copy.
+
+        ``blur_px`` stays in pixels of the photograph.
+        """
+        whole = self.height_px, self.width_px
+        size = shrunk_size(whole, longest_px)
+        if size == whole:
+            return self
+        lines = Lines.spread(whole, size)
+        maps = lines.of(self.depth_m), lines.of(self.valid)
+        return self._at(lines, maps, self.camera.resized(size[1], size[0]))
+
+    def _at(self, lines: Lines, maps: tuple[Array, NDArray[np.bool_]], camera: Camera) -> "DepthMap":
+        depth_m, valid = maps
         return replace(
             self,
-            depth_m=part.of(self.depth_m),
-            valid=part.of(self.valid),
-            layers=lambda: self.layers().cut(part),
-            camera=part.behind(self.camera),
+            depth_m=depth_m,
+            valid=valid,
+            layers_at=lambda some: self.layers_at(some.within(lines)),
+            camera=camera,
         )
 
     @property
@@ -217,22 +236,22 @@ def decide(reading: Reading, size: tuple[int, int]) -> tuple[Array, NDArray[np.b
     return depth_m, valid
 
 
-def all_layers(reading: Reading, size: tuple[int, int]) -> Callable[[], Layers]:
-    """What makes all maps when first called, and gives the same ones after."""
+def layers_at(reading: Reading, width: int, lines: Lines) -> Layers:
+    """All maps at some pixels of a photograph so many of them wide."""
+    size, columns = (len(lines.rows), len(lines.columns)), lines.columns
+    # side by side they are no copy
+    is_side_by_side = columns[-1] - columns[0] + 1 == len(columns)
+    across = slice(columns[0], columns[-1] + 1) if is_side_by_side else columns
+    layers = Layers(*(np.empty(size, np.float32) for _ in Layers.__slots__))
+    for rows in bands(size):
+        sampled = _sampled(reading, lines.rows[rows], width, "error", "depth_m", "other_m", "p_near", "blur_px")
+        error, *maps = (values[:, across] for values in sampled)
+        layers.depth_m[rows], layers.depth_alt_m[rows], layers.p_near[rows], layers.blur_px[rows] = maps
+        layers.sigma_m[rows] = in_metres(error) * maps[0]
+        for hidden in (layers.depth_m, layers.depth_alt_m, layers.sigma_m):
+            hidden[rows][error > MAX_RELATIVE_ERROR] = np.nan
+    return layers
 
-    @cache
-    def made() -> Layers:
-        layers = Layers(*(np.empty(size, np.float32) for _ in Layers.__slots__))
-        for rows in bands(size):
-            error, *maps = _sampled(reading, rows, size[1], "error", "depth_m", "other_m", "p_near", "blur_px")
-            layers.depth_m[rows], layers.depth_alt_m[rows], layers.p_near[rows], layers.blur_px[rows] = maps
-            layers.sigma_m[rows] = in_metres(error) * maps[0]
-            for hidden in (layers.depth_m, layers.depth_alt_m, layers.sigma_m):
-                hidden[rows][error > MAX_RELATIVE_ERROR] = np.nan
-        return layers
 
-    return made
-
-
-def _sampled(reading: Reading, rows: slice, width: int, *names: str) -> list[Array]:
+def _sampled(reading: Reading, rows: slice | NDArray[np.intp], width: int, *names: str) -> list[Array]:
     return [sample(getattr(reading, name), reading.ratio, rows, width) for name in names]

@@ -21,7 +21,7 @@ from service.inference.depth_map import DepthMap
 from service.inference.part import Part
 from service.inference.png import grey_png
 from service.inference.preview import render_preview
-from service.inference.resampling import bands
+from service.inference.resampling import Lines, bands, shrunk_size
 from service.opencv import cv2
 from service.optics.camera import Intrinsics
 
@@ -62,6 +62,7 @@ class Encoded:
 class Beside:
     """What goes into files beside depth: the photograph's colours [h, w, 3] into points, these maps into an npz.
 
+    The photograph, or the part of it that is answered, may be larger than the maps.
     ``origin`` is what the answer was made by, for files that have room to say so.
     """
 
@@ -186,7 +187,8 @@ def encode_ply(answer: DepthMap, beside: Beside) -> Encoded:
     )
     points["x"], points["y"] = _rays(answer, u, v) * z
     points["z"] = z
-    points["red"], points["green"], points["blue"] = beside.rgb[v, u].T
+    shown = Lines.spread((beside.rgb.shape[0], beside.rgb.shape[1]), (answer.height_px, answer.width_px))
+    points["red"], points["green"], points["blue"] = beside.rgb[shown.rows[v], shown.columns[u]].T
     lost = (
         f"{1 - is_met.mean():.1%} of the points are left out: by the camera's distortion no ray meets the sensor there"
     )
@@ -201,11 +203,10 @@ def encode_preview(answer: DepthMap, _: Beside) -> Encoded:
 
 def encode_photograph(rgb: NDArray[np.uint8], longest_px: int) -> Encoded:
     """JPEG of a picture [h, w, 3], its longer side at most so long."""
-    height, width = rgb.shape[:2]
-    scale = longest_px / max(height, width)
-    if scale < 1:
-        size = (max(1, round(width * scale)), max(1, round(height * scale)))
-        rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+    size = rgb.shape[0], rgb.shape[1]
+    smaller = shrunk_size(size, longest_px)
+    if smaller != size:
+        rgb = np.asarray(cv2.resize(rgb, smaller[::-1], interpolation=cv2.INTER_AREA), np.uint8)
     return _jpeg(rgb)
 
 
@@ -225,7 +226,7 @@ ENCODERS: dict[str, Callable[[DepthMap, Beside], Encoded]] = {
 
 
 def camera_matrix(answer: DepthMap) -> NDArray[np.float64]:
-    """K [3, 3] at the photograph's size; NaN for the four numbers of unknown intrinsics."""
+    """K [3, 3] at the maps' size; NaN for the four numbers of unknown intrinsics."""
     return np.array((answer.camera.intrinsics or UNKNOWN).matrix)
 
 
@@ -273,13 +274,15 @@ def read_point(answer: DepthMap, u: float, v: float, part: Part | None = None) -
     The answer is to all of the photograph, or to a ``part`` of it.
     """
     row, column = pixel_at(u, v, part or Part(0, 0, answer.width_px, answer.height_px))
+    # the layers of this pixel alone: all of a large photograph's are half a second
+    there = answer.layers_at(Lines.between(row, row + 1, column, column + 1))
     return PointReading(
         u,
         v,
         _number_or_none(answer.depth_m[row, column]),
-        _number_or_none(answer.depth_alt_m[row, column]),
-        _number_or_none(answer.sigma_m[row, column]),
-        float(answer.p_near[row, column]),
+        _number_or_none(there.depth_alt_m[0, 0]),
+        _number_or_none(there.sigma_m[0, 0]),
+        float(there.p_near[0, 0]),
     )
 
 

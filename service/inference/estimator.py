@@ -4,6 +4,7 @@ import math
 import weakref
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Self
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from service.inference.artifact import Interval, Manifest, ModelFolder
 from service.inference.cancellation import Cancellation
 from service.inference.copies import MAY_BE_SHARPER_PX, Read, blend
-from service.inference.depth_map import NO_ANSWER, DepthMap, Reading, all_layers, decide, fraction
+from service.inference.depth_map import NO_ANSWER, DepthMap, Reading, decide, fraction, layers_at
 from service.inference.known import Clues, KnownDepth, around
 from service.inference.later import Later
 from service.inference.pair import SIDE_RANGES, GraphPair, Side, Sights, Stopwatch
@@ -140,7 +141,7 @@ class Estimator:
         answer = DepthMap(
             depth_m=depth_m,
             valid=valid,
-            layers=all_layers(reading, size),
+            layers_at=partial(layers_at, reading, area.width_px),
             camera=area.behind(request.camera),
             scales=read.scales,
             warnings=(),

@@ -1,7 +1,7 @@
 """Maps at every pixel of the photograph: bilinear, with pixel centres where the conventions put them."""
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,37 @@ class Ratio(NamedTuple):
         return cls(*(working / (whole * stride) for whole, working in zip(photograph_size, working_size, strict=True)))
 
 
+class Lines(NamedTuple):
+    """Rows and columns of a picture, and so the pixels where they cross."""
+
+    rows: NDArray[np.intp]
+    columns: NDArray[np.intp]
+
+    @classmethod
+    def between(cls, top: int, bottom: int, left: int, right: int) -> Self:
+        """All from a row and column to before others."""
+        return cls(np.arange(top, bottom), np.arange(left, right))
+
+    @classmethod
+    def spread(cls, size: tuple[int, int], smaller: tuple[int, int]) -> Self:
+        """Of a picture (height, width) those in which the centres of a smaller copy's pixels lie."""
+        return cls(*(((2 * np.arange(few) + 1) * many) // (2 * few) for many, few in zip(size, smaller, strict=True)))
+
+    def of(self, picture: NDArray[Any]) -> NDArray[Any]:
+        """What a picture [h, w, ...] has there, copied."""
+        return picture[self.rows].take(self.columns, axis=1)
+
+    def within(self, outer: "Lines") -> "Lines":
+        """The same lines of the whole, where they are counted among some of it."""
+        return Lines(outer.rows[self.rows], outer.columns[self.columns])
+
+
+def shrunk_size(size: tuple[int, int], longest_px: int) -> tuple[int, int]:
+    """The size (height, width) whose longer side is so long; the same where it is no longer."""
+    scale = min(1.0, longest_px / max(size))
+    return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
+
+
 def bands(size: tuple[int, int]) -> Iterator[slice]:
     """Rows of an image (height, width), few enough at a time to stay in the processor's cache."""
     height, width = size
@@ -38,9 +69,11 @@ def enlarged(values: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.f
     return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_LINEAR), np.float32)
 
 
-def sample(values: NDArray[np.float32], ratio: Ratio, rows: slice, width: int) -> NDArray[np.float32]:
+def sample(
+    values: NDArray[np.float32], ratio: Ratio, rows: slice | NDArray[np.intp], width: int
+) -> NDArray[np.float32]:
     """The map [h, w] at some rows of a photograph so many pixels wide; its edges are continued."""
-    at = (np.arange(rows.start, rows.stop) + 0.5) * ratio.rows - 0.5
+    at = (np.r_[rows] + 0.5) * ratio.rows - 0.5
     above = np.floor(at).astype(np.intp)
     upper, lower = (values.take(above + i, axis=0, mode="clip") for i in (0, 1))
     lower -= upper

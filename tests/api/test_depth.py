@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from starlette.testclient import TestClient
 
 from service.inference.cancellation import Cancellation
-from service.inference.encode import MEDIA_TYPES
+from service.inference.encode import MAPS, MEDIA_TYPES
 from service.inference.worker import Worker
 from service.opencv import cv2
 from service.optics import thin_lens
@@ -133,6 +133,7 @@ def test_a_file_says_what_it_was_made_by(bench: TestClient) -> None:
     assert "; ".join(origin.pop("warnings")) == headers["Camind-Warnings"] != ""
     del origin["focus_distance_m"]
     made_by = {"camera": "bench", "revision": 1, "model": "oracle-20260101", "side": "near"}
+    made_by |= {"image_width_px": 96, "image_height_px": 64}
     assert origin == made_by | {"roi": "0,0,50,40", "known": ["3,4,1.5"], "depth_scale_m": 1.0}
 
 
@@ -378,6 +379,9 @@ def test_known_depths_are_of_the_whole_whatever_part_is_asked_for(bench: TestCli
         ({"roi": "1,2,3"}, "four whole numbers of pixels, u0,v0,u1,v1"),
         ({"focus_distance_m": "two"}, "this must be a number"),
         ({"roi": "-1,2,3,4"}, "roi"),
+        ({"longest_px": 15}, "longest_px"),
+        ({"longest_px": 100_001}, "longest_px"),
+        ({"longest_px": "16.5"}, "longest_px"),
         ({"colour": "red"}, "colour"),
     ],
 )
@@ -453,6 +457,47 @@ def test_a_part_is_the_same_part_of_the_whole_in_every_form(bench: TestClient) -
     (point,) = told["points"]
     assert (point["u"], point["v"]) == (12, 21)
     assert point["depth_m"] == pytest.approx(float(whole[21, 12]), rel=1e-5)
+
+
+@pytest.mark.parametrize(("roi", "top", "left", "size"), [(None, 0, 0, (64, 96)), ("10,20,41,50", 20, 10, (30, 31))])
+def test_a_smaller_answer_has_pixels_of_the_whole_one_in_every_form(
+    bench: TestClient, roi: str | None, top: int, left: int, size: tuple[int, int]
+) -> None:
+    body = png(np.random.default_rng(0).integers(40, 130, (64, 96, 3), np.uint8))
+    asked: dict[str, Any] = {"roi": roi, "side": "auto"}
+    small = asked | {"longest_px": 24}
+    shape = tuple(round(length * 24 / max(size)) for length in size)
+    rows, columns = (((np.arange(few) + 0.5) * many / few).astype(int) for many, few in zip(size, shape, strict=True))
+    with (
+        np.load(io.BytesIO(ask(bench, body, format="npz", **asked).content)) as whole,
+        np.load(io.BytesIO(ask(bench, body, format="npz", **small).content)) as stored,
+    ):
+        assert set(stored) == set(whole) == {*MAPS, "K"}
+        for name in MAPS:
+            np.testing.assert_array_equal(stored[name], whole[name][rows][:, columns], err_msg=name)
+        depth_m = stored["depth_m"]
+        (down, across) = (few / many for few, many in zip(shape, size, strict=True))
+        wanted = [300 * across, (40.5 - left) * across - 0.5], [300 * down, (30.5 - top) * down - 0.5]
+        np.testing.assert_allclose((stored["K"][0, [0, 2]], stored["K"][1, [1, 2]]), wanted)
+    np.testing.assert_array_equal(npy(ask(bench, body, format="npy", **small)), depth_m)
+    np.testing.assert_array_equal(
+        tifffile.imread(io.BytesIO(ask(bench, body, format="tiff", **small).content)), depth_m
+    )
+    for kind in ("png", "preview"):
+        found = cv2.imdecode(np.frombuffer(ask(bench, body, format=kind, **small).content, np.uint8), -1)
+        assert found is not None
+        assert found.shape[:2] == shape
+    points = f"element vertex {shape[0] * shape[1]}\n".encode()
+    assert points in ask(bench, body, format="ply", **small).content
+    # what is read is the photograph's
+    told = [ask(bench, body, format="json", at="12,21", **query).json() for query in (asked, small)]
+    assert told[0] == told[1]
+    assert (told[0]["height_px"], told[0]["width_px"]) == size
+
+
+def test_no_answer_is_enlarged(bench: TestClient) -> None:
+    assert ask(bench, format="npz", longest_px=96).content == ask(bench, format="npz").content
+    assert npy(ask(bench, longest_px=4096, format="npy")).shape == (64, 96)
 
 
 @pytest.mark.parametrize("roi", ["10,20,10,50", "50,20,40,30", "0,0,97,64", "0,0,96,65"])
@@ -557,5 +602,5 @@ def test_the_document_lists_every_form_and_every_kind(client: TestClient) -> Non
     assert {"image/jpeg", "image/png", "multipart/form-data"} <= set(operation["requestBody"]["content"])
     assert {"404", "406", "413", "415", "422", "503"} <= set(operation["responses"])
     assert {parameter["name"] for parameter in operation["parameters"]} == {
-        *("camera", "side", "format", "at", "maps", "roi", "focus_distance_m", "known")
+        *("camera", "side", "format", "at", "maps", "roi", "longest_px", "focus_distance_m", "known")
     }

@@ -27,6 +27,7 @@ from service.inference.encode import (
 )
 from service.inference.png import grey_png
 from service.inference.preview import render_preview
+from service.inference.resampling import Lines
 from service.opencv import cv2
 from service.optics.camera import Camera, Intrinsics
 
@@ -45,7 +46,7 @@ def answer() -> DepthMap:
     return DepthMap(
         depth_m=depth_m,
         valid=np.isfinite(depth_m),
-        layers=lambda: layers,
+        layers_at=lambda lines: Layers(*(lines.of(getattr(layers, name)) for name in Layers.__slots__)),
         camera=CAMERA,
         scales=(1.0,),
         warnings=(),
@@ -111,10 +112,10 @@ def test_npz_holds_all_maps_and_the_camera_matrix(answer: DepthMap) -> None:
 
 
 def test_an_npz_holds_the_maps_that_are_asked_for_and_the_camera_matrix(answer: DepthMap) -> None:
-    def never() -> Layers:
+    def never(_: Lines) -> Layers:
         raise AssertionError("nothing of the layers was asked for")
 
-    unread = replace(answer, layers=never)
+    unread = replace(answer, layers_at=never)
     body = encode_npz(unread, Beside(RGB, ("valid", "depth_m", "depth_m"))).body
     with np.load(io.BytesIO(body)) as stored:
         assert set(stored) == {"depth_m", "valid", "K"}
@@ -158,6 +159,19 @@ def test_ply_points_project_back_to_their_pixels(answer: DepthMap) -> None:
     np.testing.assert_allclose(points["x"] / points["z"] * 50 + 19.5, u, atol=1e-3)
     np.testing.assert_allclose(points["y"] / points["z"] * 52 + 14.5, v, atol=1e-3)
     np.testing.assert_array_equal(np.stack([points[c] for c in "rgb"], 1), RGB[v, u])
+
+
+def test_points_of_a_smaller_map_look_where_the_photograph_s_pixels_do_and_have_their_colours(answer: DepthMap) -> None:
+    head, _, body = encode_ply(answer.shrunk(16), BESIDE).body.partition(b"end_header\n")
+    points = np.frombuffer(body, np.dtype([(axis, "<f4") for axis in "xyz"] + [(colour, "u1") for colour in "rgb"]))
+    assert f"element vertex {16 * 12}\n".encode() in head
+    # a pixel of it is two and a half of the photograph's
+    v, u = (lines.ravel() * 2.5 + 0.75 for lines in np.indices((12, 16)))
+    np.testing.assert_allclose(points["x"] / points["z"] * 50 + 19.5, u, atol=1e-3)
+    np.testing.assert_allclose(points["y"] / points["z"] * 52 + 14.5, v, atol=1e-3)
+    row, column = (np.floor(place + 0.5).astype(int) for place in (v, u))
+    np.testing.assert_array_equal(points["z"], answer.depth_m[row, column])
+    np.testing.assert_array_equal(np.stack([points[c] for c in "rgb"], 1), RGB[row, column])
 
 
 def test_points_leave_the_lens_distortion_out(answer: DepthMap) -> None:

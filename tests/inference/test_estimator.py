@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from service.inference.artifact import Interval, load_model_folder
 from service.inference.cancellation import Cancellation, Cancelled
-from service.inference.depth_map import LEAST_BLUR_ERROR_PX, Reading, all_layers, decide
+from service.inference.depth_map import LEAST_BLUR_ERROR_PX, Reading, decide, layers_at
 from service.inference.estimator import SURROUNDINGS_PX, Estimator
 from service.inference.hypotheses import in_metres
 from service.inference.known import KnownDepth
 from service.inference.pair import MAPS, GraphPair, RawMaps, Side
 from service.inference.part import Part
+from service.inference.resampling import Lines
 from service.inference.session import Graph
 from service.optics import thin_lens
 from service.optics.camera import Camera, Intrinsics
@@ -232,7 +233,7 @@ def test_the_side_is_the_one_that_is_off_by_less_on_average(
     reading = Reading.of(maps, CAMERA, (64, 96), load_model_folder(folder).manifest, "auto", 20.0)
     answer, other = (near_m, far_m) if is_near else (far_m, near_m)
     np.testing.assert_allclose(decide(reading, (64, 96))[0], answer, rtol=1e-4)
-    layers = all_layers(reading, (64, 96))()
+    layers = layers_at(reading, 96, Lines.between(0, 64, 0, 96))
     np.testing.assert_allclose(layers.depth_alt_m, other, rtol=1e-4)
     np.testing.assert_allclose(layers.p_near, p_near, rtol=1e-4)
 
@@ -243,7 +244,7 @@ def test_doubt_between_depths_far_apart_is_said_and_still_an_answer(folder: Path
     maps = {name: np.full((32, 48), value, np.float32) for name, value in values.items()}
     reading = Reading.of(maps, CAMERA, (64, 96), load_model_folder(folder).manifest, "auto", 20.0)
     assert decide(reading, (64, 96))[1].all()
-    layers = all_layers(reading, (64, 96))()
+    layers = layers_at(reading, 96, Lines.between(0, 64, 0, 96))
     np.testing.assert_allclose(layers.sigma_m, layers.depth_m, rtol=0.01)
     assert (layers.sigma_m <= layers.depth_m).all()
 
