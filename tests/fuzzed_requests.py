@@ -44,7 +44,14 @@ def request(number: int) -> Request:
 def _photograph(random: Random) -> Request:
     kind = _kind(random)
     form = random.choice(
-        ("", "&format=json&at=3,3", "&format=ply", "&format=preview", "&roi=1,1,9,9&longest_px=16&format=npz", "&known=3,3,1.5")
+        (
+            "",
+            "&format=json&at=3,3",
+            "&format=ply",
+            "&format=preview",
+            "&roi=1,1,9,9&longest_px=16&format=npz",
+            "&known=3,3,1.5",
+        )
     )
     return Request(f"/depth?camera=bench{form}", _declared(random, kind), _mutated_file(random, kind))
 

@@ -12,7 +12,7 @@ export const KEY_CHANGED = "camind:key";
  * @typedef {object} RequestOptions
  * @property {string} [method]
  * @property {Record<string, string>} [headers]
- * @property {XMLHttpRequestBodyInit | null} [body]
+ * @property {?XMLHttpRequestBodyInit} [body]
  * @property {AbortSignal} [signal]
  * @property {boolean} [asks] whether a missing key is asked for; false for what nobody has clicked for
  */
@@ -28,8 +28,8 @@ export class Problem extends Error {
 	detail = "";
 	type = "about:blank";
 	errors = /** @type {FieldProblem[]} */ ([]);
-	requestId = /** @type {string | null} */ (null);
-	retryAfterS = /** @type {number | null} */ (null);
+	requestId = /** @type {?string} */ (null);
+	retryAfterS = /** @type {?number} */ (null);
 
 	/** @param {{status: number, title: string, detail: string} & Partial<Problem>} about */
 	constructor(about) {
@@ -49,7 +49,7 @@ export function problemOf(error) {
 	throw error;
 }
 
-/** @type {string | null} */
+/** @type {?string} */
 let held = null;
 try {
 	held = sessionStorage.getItem(KEY);
@@ -57,10 +57,10 @@ try {
 	// a browser that stores nothing for a page still shows it
 }
 
-/** @returns {string | null} the API key of this tab */
+/** @returns {?string} the API key of this tab */
 export const storedKey = () => held;
 
-/** @param {string | null} key */
+/** @param {?string} key */
 function holdKey(key) {
 	held = key;
 	try {
@@ -85,7 +85,7 @@ export function setKeyAsker(asker) {
 /** @type {Promise<string | null> | null} */
 let asking = null;
 
-/** The key, asked for once however many requests want it. @param {string | null} reason */
+/** The key, asked for once however many requests want it. @param {?string} reason */
 async function askedKey(reason) {
 	asking ??= ask(reason).finally(() => {
 		asking = null;
@@ -146,7 +146,7 @@ function readProblem(status, headers, text) {
 	return new Problem({
 		status,
 		type: String(told.type ?? "about:blank"),
-		title: String(told.title ?? `The request failed (${status}).`),
+		title: String(told.title ?? `The request failed (${status})`).replace(/[\w)]$/, "$&."),
 		detail: String(told.detail ?? "The answer is not the service's own: something in front of it may have refused."),
 		errors: Array.isArray(told.errors) ? told.errors : [],
 		requestId: headers.get("X-Request-Id"),
@@ -209,7 +209,7 @@ export function sendJson(path, body, { method = "POST", headers = {}, ...options
 	return getJson(path, { ...options, method, headers: about, body: JSON.stringify(body) });
 }
 
-/** @param {any} camera @param {number | null} revision that it replaces; null for a new camera @returns {Promise<any>} the camera as it is stored */
+/** @param {any} camera @param {?number} revision that it replaces; null for a new camera @returns {Promise<any>} the camera as it is stored */
 export function storeCamera(camera, revision) {
 	if (revision === null) return sendJson("cameras", camera).catch(tellTaken);
 	const headers = { "If-Match": `"${revision}"` };

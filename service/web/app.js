@@ -19,7 +19,7 @@ import { html, render, useCallback, useEffect, useRef, useState } from "./vendor
  * @property {boolean} shown whether the view's tab is in front
  * @property {any[] | null} cameras as the API gives them, by name; null before they are there
  * @property {boolean} lacksCameras whether they could not be had
- * @property {string | null} camera the name in the address, for the view in front
+ * @property {?string} camera the name in the address, for the view in front
  * @property {(about?: {stored?: any}) => Promise<void>} reloadCameras `stored` is among them even where that fails
  * @property {(tab: Tab, about?: {camera?: string | null, replaces?: boolean}) => void} go change the tab, and pick the camera
  *   there; the way back leads past an address that is replaced
@@ -45,7 +45,7 @@ function readHash() {
 	}
 }
 
-/** @param {Tab} tab @param {string | null} [camera] */
+/** @param {Tab} tab @param {?string} [camera] */
 const hashOf = (tab, camera) => (camera ? `#${tab}/${encodeURIComponent(camera)}` : `#${tab}`);
 
 /** @type {ViewProps["go"]} */
@@ -147,7 +147,6 @@ function App() {
 			</nav>
 			${hasKey &&
 			html`<button
-				type="button"
 				class="quiet"
 				onClick=${() => {
 					forgetKey();

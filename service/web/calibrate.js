@@ -1,6 +1,7 @@
 /** The calibration, step by step: print a sheet, photograph it, wait, and accept what was found. */
 
 import { Problem, events, getJson, problemOf, storedKey, upload } from "./api.js";
+import { stay } from "./cameras.js";
 import { Ended, Running } from "./job_step.js";
 import { toMetres, when } from "./numbers.js";
 import { Photographs, useLooks } from "./photo_step.js";
@@ -26,12 +27,12 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
 	const [photos, setPhotos] = useState(/** @type {Photo[]} */ ([]));
 	const [name, setName] = useState("");
 	const [focus, setFocus] = useState("");
-	const [job, setJob] = useState(/** @type {any | null} */ (null));
+	const [job, setJob] = useState(/** @type {?any} */ (null));
 	const [recent, setRecent] = useState(/** @type {any[]} */ ([]));
 	const [problem, setProblem] = useProblem();
 	const [attempt, setAttempt] = useState(0);
 	const [sent, setSent] = useState(/** @type {number | null | undefined} */ (undefined));
-	const title = useRef(/** @type {HTMLHeadingElement | null} */ (null));
+	const title = useRef(/** @type {?HTMLHeadingElement} */ (null));
 	const hasMoved = useRef(false);
 	const requestKey = useRef("");
 	const known = cameras?.find((one) => one.name === name.trim()) ?? null;
@@ -53,6 +54,10 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
 		setStep(to);
 	}
 
+	const isHeld = photos.length > 0 && step < 2; // and not sent
+	useEffect(() => {
+		(isHeld ? addEventListener : removeEventListener)("beforeunload", stay);
+	}, [isHeld]);
 	useEffect(() => {
 		if (hasMoved.current) title.current?.focus();
 	}, [step]);
@@ -128,7 +133,6 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
 				${STEPS.map(
 					(words, number) => html`<li>
 						<button
-							type="button"
 							aria-current=${number === step ? "step" : undefined}
 							disabled=${number > reached || (number === 2 && reached === 3)}
 							onClick=${() => move(number)}
@@ -168,7 +172,6 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
 				<${ProblemBox} problem=${nameFault || focusFault ? null : problem} />
 				<div class="row">
 					<button
-						type="button"
 						class="primary"
 						disabled=${!query || focusM === undefined || name.trim() === "" || !photos.some(({ role }) => role === "defocused")}
 						onClick=${start}
@@ -188,7 +191,7 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
 				job=${job}
 				cameras=${cameras}
 				go=${go}
-				onAccepted=${async (/** @type {any} */ stored) => {
+				onAccepted=${async (stored) => {
 					setJob(stored);
 					announce(`Stored as revision ${stored.camera_revision} of camera ${stored.camera}.`);
 					await reloadCameras();
@@ -224,7 +227,7 @@ function Recent({ items, open, onOpen }) {
 						</td>
 						<td class="number">
 							${one.id !== open &&
-							html`<button type="button" class="quiet" aria-label=${`Open the calibration of ${one.camera}, ${one.state}`} onClick=${() => onOpen(one.id)}>
+							html`<button class="quiet" aria-label=${`Open the calibration of ${one.camera}, ${one.state}`} onClick=${() => onOpen(one.id)}>
 								Open
 							</button>`}
 						</td>
@@ -238,7 +241,7 @@ function Recent({ items, open, onOpen }) {
 /**
  * Follows a calibration until it has ended; a stream that breaks is opened again.
  *
- * @param {any | null} job
+ * @param {?any} job
  * @param {number} attempt another one begins anew
  * @param {(job: any) => void} setJob
  * @param {(change: (old: Problem | null) => Problem | null) => void} setProblem

@@ -17,7 +17,7 @@ export function exportCameras(cameras, name) {
 
 /** @param {{file: File, onClose: (stored: number) => void}} props */
 export function ImportDialog({ file, onClose }) {
-	const dialog = useRef(/** @type {HTMLDialogElement | null} */ (null));
+	const dialog = useRef(/** @type {?HTMLDialogElement} */ (null));
 	const [steps, setSteps] = useState(/** @type {Step[] | null} */ (null));
 	const [fault, setFault] = useState("");
 	const [isBusy, setIsBusy] = useState(false);
@@ -56,10 +56,10 @@ export function ImportDialog({ file, onClose }) {
 				<//>`}
 				<div class="row">
 					${wanted.length > 0 &&
-					html`<button type="button" class="primary" disabled=${isBusy} onClick=${carryOut}>
+					html`<button class="primary" disabled=${isBusy} onClick=${carryOut}>
 						Import ${counted(wanted.length, "camera")}
 					</button>`}
-					<button type="button" onClick=${() => dialog.current?.close()}>${stored > 0 ? "Close" : "Cancel"}</button>
+					<button onClick=${() => dialog.current?.close()}>${stored > 0 ? "Close" : "Cancel"}</button>
 					<span role="status">
 						${steps
 							? wanted.length === 0 && `${counted(stored, "camera is", "cameras are")} stored, ${failed} refused`

@@ -24,7 +24,7 @@ const WAIT_MS = 250;
 
 /** @typedef {import("./camera_specs.js").Fields} Fields */
 
-/** Bring the reader to a heading, which may be out of sight. @param {HTMLElement | null} heading */
+/** Bring the reader to a heading, which may be out of sight. @param {?HTMLElement} heading */
 export function arriveAt(heading) {
 	heading?.focus({ preventScroll: true });
 	const top = heading?.getBoundingClientRect().top ?? 0;
@@ -41,11 +41,11 @@ export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 	const [held, setHeld] = useState(/** @type {{k_cam_px: number, focus_distance_m: number} | null} */ (editing));
 	const [problem, setProblem] = useProblem();
 	const [told, setTold] = useState(/** @type {string[]} */ ([]));
-	const [theirs, setTheirs] = useState(/** @type {any | null} */ (null));
+	const [theirs, setTheirs] = useState(/** @type {?any} */ (null));
 	const [isSaving, setIsSaving] = useState(false);
 	const { preview, faults: previewFaults } = usePreview(fields);
-	const title = useRef(/** @type {HTMLHeadingElement | null} */ (null));
-	const trouble = useRef(/** @type {HTMLElement | null} */ (null));
+	const title = useRef(/** @type {?HTMLHeadingElement} */ (null));
+	const trouble = useRef(/** @type {?HTMLElement} */ (null));
 	const faults = [...unclear(fields), ...previewFaults, ...(problem?.errors ?? [])];
 	const missing = missingOf(fields);
 	const refocused = refocusedKCam(fields, held);
@@ -60,7 +60,7 @@ export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 		onTyped();
 	}
 
-	/** @param {number | null} revision that is replaced; null for a new camera */
+	/** @param {?number} revision that is replaced; null for a new camera */
 	async function save(revision) {
 		setIsSaving(true);
 		setProblem(null);
@@ -110,7 +110,7 @@ export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 		<form
 			class="card"
 			aria-labelledby="camera-form-title"
-			onSubmit=${(/** @type {Event} */ event) => {
+			onSubmit=${(event) => {
 				event.preventDefault();
 				save(base?.revision ?? null);
 			}}
@@ -226,7 +226,7 @@ export function Field({ path, label, value, form = "camera", kind = "decimal", h
 	const fault = faults.find(({ pointer }) => pointer === `#/${path}` || pointer.startsWith(`#/${path}/`))?.detail;
 	return html`<${TextField}
 		...${{ id: `${form}-${path.replace("/", "-")}`, label, value, kind, fault, hint, disabled, role: null }}
-		onInput=${(/** @type {string} */ text) => onChange({ [path]: text })}
+		onInput=${(text) => onChange({ [path]: text })}
 	/>`;
 }
 

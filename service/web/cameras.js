@@ -16,15 +16,15 @@ const SOURCES = { given: "given", lens: "from lens specs", calibration: "calibra
 /** @typedef {{kind: "none"} | {kind: "read", name: string} | {kind: "new"} | {kind: "edit", camera: any}} Open */
 
 /** Ask before the page goes. @param {Event} event */
-const stay = (event) => event.preventDefault();
+export const stay = (event) => event.preventDefault();
 
 /** @param {import("./app.js").ViewProps} props */
 export function CamerasView({ shown, cameras, lacksCameras, camera, reloadCameras, go, announce }) {
 	const [open, setOpen] = useState(/** @type {Open} */ ({ kind: "none" }));
-	const [file, setFile] = useState(/** @type {File | null} */ (null));
+	const [file, setFile] = useState(/** @type {?File} */ (null));
 	const [filter, setFilter] = useState("");
 	const [most, setMost] = useState(A_PAGE);
-	const importing = useRef(/** @type {HTMLInputElement | null} */ (null));
+	const importing = useRef(/** @type {?HTMLInputElement} */ (null));
 	const found = useMemo(
 		() => (cameras ?? []).filter(({ name }) => name.toLowerCase().includes(filter.toLowerCase())),
 		[cameras, filter],
@@ -56,7 +56,7 @@ export function CamerasView({ shown, cameras, lacksCameras, camera, reloadCamera
 		setOpen(next);
 	}
 
-	/** @param {string | null} name */
+	/** @param {?string} name */
 	function show(name) {
 		turnTo(name ? { kind: "read", name } : { kind: "none" });
 		go("cameras", { camera: name, replaces: true });
@@ -86,9 +86,9 @@ export function CamerasView({ shown, cameras, lacksCameras, camera, reloadCamera
 			<div class="row ends">
 				<h2>Cameras</h2>
 				<div class="row">
-					<button type="button" class="primary" onClick=${begin}>New camera</button>
-					<button type="button" onClick=${() => importing.current?.click()}>Import</button>
-					<button type="button" disabled=${!cameras?.length} onClick=${() => exportCameras(cameras ?? [], "cameras")}>
+					<button class="primary" onClick=${begin}>New camera</button>
+					<button onClick=${() => importing.current?.click()}>Import</button>
+					<button disabled=${!cameras?.length} onClick=${() => exportCameras(cameras ?? [], "cameras")}>
 						Export all
 					</button>
 					<input
@@ -97,7 +97,7 @@ export function CamerasView({ shown, cameras, lacksCameras, camera, reloadCamera
 						accept=".json,application/json"
 						hidden
 						aria-label="Cameras to import"
-						onChange=${(/** @type {any} */ { target }) => {
+						onChange=${({ target }) => {
 							setFile(target.files[0] ?? null);
 							target.value = "";
 						}}
@@ -112,14 +112,13 @@ export function CamerasView({ shown, cameras, lacksCameras, camera, reloadCamera
 					${(filter || (cameras?.length ?? 0) > A_PAGE / 2) &&
 					html`<label class="field">
 						Find
-						<input type="search" value=${filter} onInput=${(/** @type {any} */ event) => setFilter(event.target.value)} />
+						<input type="search" value=${filter} onInput=${(event) => setFilter(event.target.value)} />
 					</label>`}
 					${found.length > 0 &&
 					html`<ul class="camera-list">
 						${found.slice(0, most).map(
 							(one) => html`<li key=${one.name}>
 								<button
-									type="button"
 									aria-pressed=${open.kind === "read" && open.name === one.name}
 									onClick=${() => choose(one.name)}
 								>
@@ -133,7 +132,7 @@ export function CamerasView({ shown, cameras, lacksCameras, camera, reloadCamera
 						)}
 					</ul>`}
 					${found.length > most &&
-					html`<button type="button" onClick=${() => setMost(most + A_PAGE)}>
+					html`<button onClick=${() => setMost(most + A_PAGE)}>
 						Show more (${found.length - most} left)
 					</button>`}
 				</section>
@@ -165,7 +164,7 @@ export function CamerasView({ shown, cameras, lacksCameras, camera, reloadCamera
 			${file &&
 			html`<${ImportDialog}
 				file=${file}
-				onClose=${(/** @type {number} */ stored) => {
+				onClose=${(stored) => {
 					setFile(null);
 					if (stored > 0) changed(`${counted(stored, "camera is", "cameras are")} imported.`);
 				}}
@@ -185,7 +184,7 @@ function CameraCard({ camera, opened, go, onEdit, onDeleted, onStale }) {
 	const [attempt, setAttempt] = useState(0);
 	const [isDeleting, setIsDeleting] = useState(false);
 	const { lens, intrinsics } = camera;
-	const title = useRef(/** @type {HTMLHeadingElement | null} */ (null));
+	const title = useRef(/** @type {?HTMLHeadingElement} */ (null));
 	useEffect(() => arriveAt(title.current), [opened]);
 	useEffect(() => {
 		const stop = new AbortController();
@@ -204,11 +203,11 @@ function CameraCard({ camera, opened, go, onEdit, onDeleted, onStale }) {
 			</div>
 			${camera.description && html`<p>${camera.description}</p>`}
 			<div class="row">
-				<button type="button" class="primary" onClick=${() => go("depth", { camera: camera.name })}>Measure depth</button>
-				<button type="button" onClick=${onEdit}>Edit</button>
-				<button type="button" onClick=${() => go("calibrate", { camera: camera.name })}>Calibrate</button>
-				<button type="button" onClick=${() => exportCameras([camera], camera.name)}>Export</button>
-				<button type="button" class="danger" onClick=${() => setIsDeleting(true)}>Delete</button>
+				<button class="primary" onClick=${() => go("depth", { camera: camera.name })}>Measure depth</button>
+				<button onClick=${onEdit}>Edit</button>
+				<button onClick=${() => go("calibrate", { camera: camera.name })}>Calibrate</button>
+				<button onClick=${() => exportCameras([camera], camera.name)}>Export</button>
+				<button class="danger" onClick=${() => setIsDeleting(true)}>Delete</button>
 			</div>
 			<${CameraCurve} camera=${camera} points=${curve?.points ?? null} />
 			<${ProblemBox} problem=${problem} onRetry=${() => setAttempt(attempt + 1)} />
@@ -237,10 +236,10 @@ function CameraCard({ camera, opened, go, onEdit, onDeleted, onStale }) {
 /** @param {{path: string}} props */
 function Revisions({ path }) {
 	const [items, setItems] = useState(/** @type {any[]} */ ([]));
-	const [cursor, setCursor] = useState(/** @type {string | null} */ (null));
+	const [cursor, setCursor] = useState(/** @type {?string} */ (null));
 	const [problem, setProblem] = useProblem();
 
-	/** @param {string | null} after */
+	/** @param {?string} after */
 	async function load(after) {
 		setCursor(null); // until the next is known
 		try {
@@ -255,7 +254,7 @@ function Revisions({ path }) {
 
 	return html`
 		<details
-			onToggle=${(/** @type {Event} */ event) => {
+			onToggle=${(event) => {
 				if (/** @type {HTMLDetailsElement} */ (event.target).open && items.length === 0) load(null);
 			}}
 		>
@@ -272,7 +271,7 @@ function Revisions({ path }) {
 					</li>`,
 				)}
 			</ol>
-			${cursor && html`<button type="button" onClick=${() => load(cursor)}>Show earlier ones</button>`}
+			${cursor && html`<button onClick=${() => load(cursor)}>Show earlier ones</button>`}
 		</details>
 	`;
 }
@@ -286,7 +285,7 @@ function changesOf(before, after) {
 
 /** @param {{camera: any, path: string, onClose: () => void, onDeleted: () => void, onStale: () => void}} props */
 function DeleteDialog({ camera, path, onClose, onDeleted, onStale }) {
-	const dialog = useRef(/** @type {HTMLDialogElement | null} */ (null));
+	const dialog = useRef(/** @type {?HTMLDialogElement} */ (null));
 	const [problem, setProblem] = useProblem();
 	useEffect(() => dialog.current?.showModal(), []);
 
@@ -309,9 +308,9 @@ function DeleteDialog({ camera, path, onClose, onDeleted, onStale }) {
 				<${ProblemBox} problem=${problem} />
 				<div class="row">
 					${[404, 412].includes(problem?.status ?? 0)
-						? html`<button type="button" class="primary" onClick=${onStale}>See how it is now</button>`
-						: html`<button type="button" class="danger" onClick=${remove}>Delete ${camera.name}</button>`}
-					<button type="button" onClick=${() => dialog.current?.close()}>Keep it</button>
+						? html`<button class="primary" onClick=${onStale}>See how it is now</button>`
+						: html`<button class="danger" onClick=${remove}>Delete ${camera.name}</button>`}
+					<button onClick=${() => dialog.current?.close()}>Keep it</button>
 				</div>
 			</div>
 		</dialog>

@@ -30,7 +30,7 @@ const ZOOMS = [0.05, 20];
 /** @typedef {{positions: Float32Array, colours: Uint8Array, centre: number[], spacing: number}} Points */
 
 export class Cloud {
-	/** @param {OffscreenCanvas} canvas @param {(count: number) => void} onDrawn @returns {Cloud | null} null where the browser has no WebGL2 */
+	/** @param {OffscreenCanvas} canvas @param {(count: number) => void} onDrawn @returns {?Cloud} null where the browser has no WebGL2 */
 	static on(canvas, onDrawn) {
 		const gl = canvas.getContext("webgl2", { antialias: false, powerPreference: "low-power" });
 		return gl && new Cloud(canvas, gl, onDrawn);
@@ -46,7 +46,7 @@ export class Cloud {
 		this.gl = gl;
 		this.onDrawn = onDrawn;
 		this.view = { ...START };
-		/** @type {Points | null} */
+		/** @type {?Points} */
 		this.points = null;
 		this.frame = 0;
 		this.setUp();

@@ -33,7 +33,7 @@ const KEYS = {
  * }} props
  */
 export function CloudView({ reader, result, look, hasPhotograph, isShown }) {
-	const canvas = useRef(/** @type {HTMLCanvasElement | null} */ (null));
+	const canvas = useRef(/** @type {?HTMLCanvasElement} */ (null));
 	const [tell, setTell] = useState(/** @type {{to: Tell} | null} */ (null));
 	const [isMissing, setIsMissing] = useState(false);
 	const [isPhotograph, setIsPhotograph] = useState(true);
@@ -84,9 +84,9 @@ export function CloudView({ reader, result, look, hasPhotograph, isShown }) {
 			aria-describedby="depth-cloud-hint"
 		></canvas>
 		<div class="row">
-			<button type="button" onClick=${act(["zoom", ZOOM])} aria-label="Nearer">+</button>
-			<button type="button" onClick=${act(["zoom", 1 / ZOOM])} aria-label="Farther">−</button>
-			<button type="button" onClick=${act(["reset"])}>Reset view</button>
+			<button onClick=${act(["zoom", ZOOM])} aria-label="Nearer">+</button>
+			<button onClick=${act(["zoom", 1 / ZOOM])} aria-label="Farther">−</button>
+			<button onClick=${act(["reset"])}>Reset view</button>
 			${hasPhotograph &&
 			html`<${Switch} title="Photograph's colours" isOn=${isPhotograph} onSwitch=${setIsPhotograph} />`}
 		</div>
@@ -99,7 +99,7 @@ export function CloudView({ reader, result, look, hasPhotograph, isShown }) {
 /**
  * @param {HTMLCanvasElement} canvas which is the worker's from now on
  * @param {() => void} onMissing where there is no WebGL2, or no worker
- * @returns {Worker | null} null where a worker cannot draw
+ * @returns {?Worker} null where a worker cannot draw
  */
 function drawOn(canvas, onMissing) {
 	if (!canvas.transferControlToOffscreen) return null;

@@ -9,7 +9,7 @@ import { Cloud } from "./cloud.js";
  */
 
 const scope = /** @type {Worker} */ (/** @type {unknown} */ (globalThis));
-/** @type {Cloud | null} */
+/** @type {?Cloud} */
 let cloud = null;
 
 scope.onmessage = (/** @type {MessageEvent<Order | OffscreenCanvas>} */ { data }) => {

@@ -16,29 +16,29 @@ export function Colours({ look, facts, onLook }) {
 	const change = (/** @type {Partial<Look>} */ part) => onLook({ ...look, ...part });
 	return html`<section class="card stack" aria-label="Colours">
 		<h3>Colours</h3>
-		<${Choice} label="Map" value=${look.map} options=${MAPS} onChange=${(/** @type {Look["map"]} */ map) => change({ map })} />
+		<${Choice} label="Map" value=${look.map} options=${MAPS} onChange=${(map) => change({ map })} />
 		${spread &&
 		html`
 			<${Bound} title="Near" value=${look.nearM} ...${spread}
-				onValue=${(/** @type {number} */ value) => change({ nearM: Math.min(value, look.farM / LEAST_RATIO) })} />
+				onValue=${(value) => change({ nearM: Math.min(value, look.farM / LEAST_RATIO) })} />
 			<${Bound} title="Far" value=${look.farM} ...${spread}
-				onValue=${(/** @type {number} */ value) => change({ farM: Math.max(value, look.nearM * LEAST_RATIO) })} />
+				onValue=${(value) => change({ farM: Math.max(value, look.nearM * LEAST_RATIO) })} />
 			<div class="row">
-				<button type="button" onClick=${() => change({ nearM: spread.nearM, farM: spread.farM })}>Fit to 2–98 %</button>
-				<button type="button" onClick=${() => change({ nearM: spread.leastM, farM: spread.mostM })}>Whole range</button>
+				<button onClick=${() => change({ nearM: spread.nearM, farM: spread.farM })}>Fit to 2–98 %</button>
+				<button onClick=${() => change({ nearM: spread.leastM, farM: spread.mostM })}>Whole range</button>
 			</div>
 		`}
 		<${Switch} title=${`Hatch no answer (${share(1 - validShare)})`} isOn=${look.hatchesNothing}
-			onSwitch=${(/** @type {boolean} */ hatchesNothing) => change({ hatchesNothing })} />
+			onSwitch=${(hatchesNothing) => change({ hatchesNothing })} />
 		<${Switch} title=${`Dot either side (${share(eitherShare)})`} isOn=${look.dotsEither}
-			onSwitch=${(/** @type {boolean} */ dotsEither) => change({ dotsEither })} />
+			onSwitch=${(dotsEither) => change({ dotsEither })} />
 	</section>`;
 }
 
 /** @param {{title: string, value: number, leastM: number, mostM: number, onValue: (value: number) => void}} props */
 function Bound({ title, value, leastM, mostM, onValue }) {
 	// what is being typed stays, whatever is drawn anew meanwhile
-	const [typed, setTyped] = useState(/** @type {string | null} */ (null));
+	const [typed, setTyped] = useState(/** @type {?string} */ (null));
 	const span = Math.log(mostM / leastM);
 	return html`<div class="depth-bound">
 		<span>${title}</span>
@@ -49,15 +49,15 @@ function Bound({ title, value, leastM, mostM, onValue }) {
 			value=${Math.round((STEPS * Math.log(value / leastM)) / span)}
 			aria-label=${`${title} end of the colours`}
 			aria-valuetext=${`${inMetres(value)} metres`}
-			onInput=${(/** @type {any} */ event) => onValue(leastM * Math.exp((span * event.target.value) / STEPS))}
+			onInput=${(event) => onValue(leastM * Math.exp((span * event.target.value) / STEPS))}
 		/>
 		<input
 			type="text"
 			inputmode="decimal"
 			value=${typed ?? inMetres(value)}
 			aria-label=${`${title} end of the colours, metres`}
-			onInput=${(/** @type {any} */ event) => setTyped(event.target.value)}
-			onChange=${(/** @type {any} */ event) => {
+			onInput=${(event) => setTyped(event.target.value)}
+			onChange=${(event) => {
 				setTyped(null);
 				const metres = toMetres(event.target.value);
 				if (metres) onValue(metres);
@@ -70,7 +70,7 @@ function Bound({ title, value, leastM, mostM, onValue }) {
 /** @param {{title: string, isOn: boolean, onSwitch: (isOn: boolean) => void}} props */
 export function Switch({ title, isOn, onSwitch }) {
 	return html`<label class="choice">
-		<input type="checkbox" checked=${isOn} onChange=${(/** @type {any} */ event) => onSwitch(event.target.checked)} />
+		<input type="checkbox" checked=${isOn} onChange=${(event) => onSwitch(event.target.checked)} />
 		${title}
 	</label>`;
 }

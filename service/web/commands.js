@@ -4,7 +4,7 @@
  * @typedef {object} Ask
  * @property {string} camera
  * @property {string} side
- * @property {number | null} focusM
+ * @property {?number} focusM
  * @property {import("./tape.js").KnownDepth[]} known
  * @property {string} format
  */

@@ -29,7 +29,6 @@ import { html, useCallback, useEffect, useMemo, useRef, useState } from "./vendo
  * @property {{camera: string, side: string, focusM: number | null, known: KnownDepth[]}} asked
  * @property {File} file
  * @property {Facts} facts
- * @property {Blob} npz
  * @property {number} focusM the focus distance that was used
  * @property {number} revision of the camera
  * @property {string[]} warnings
@@ -52,6 +51,7 @@ const STEPS = {
 	draw: "Drawing",
 };
 const MOST_PX = 1600;
+const MANY = 10; // cameras are searched
 const SETTLED_MS = 300;
 const NOT_THE_FRAME = "urn:camind:problem:image-size-mismatch";
 const NO_PHOTOGRAPH = /:(invalid-image|unsupported-kind)$/;
@@ -61,38 +61,43 @@ const FIRST_LOOK = { map: "cividis", nearM: 1, farM: 2, hatchesNothing: true, do
 /** @param {import("./app.js").ViewProps} props */
 export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloadCameras, go, announce }) {
 	const reader = useMemo(() => new DepthReader(), []);
-	const [file, setFile] = useState(/** @type {File | null} */ (null));
+	const [file, setFile] = useState(/** @type {?File} */ (null));
 	const [leftOut, setLeftOut] = useState(0);
 	const [photograph, setPhotograph] = useState(
 		/** @type {{bitmap: ImageBitmap, width: number, height: number} | null} */ (null),
 	);
 	const [name, setName] = useState("");
+	const [filter, setFilter] = useState("");
 	const [side, setSide] = useState("auto");
 	const [focus, setFocus] = useState("");
-	const [focusM, setFocusM] = useState(/** @type {number | null} */ (null));
+	const [focusM, setFocusM] = useState(/** @type {?number} */ (null));
 	const [known, setKnown] = useState(/** @type {KnownDepth[]} */ ([]));
 	const [attempt, setAttempt] = useState(0);
 	const [isDrafting, setIsDrafting] = useState(false);
-	const [phase, setPhase] = useState(/** @type {Phase | null} */ (null));
+	const [phase, setPhase] = useState(/** @type {?Phase} */ (null));
 	const [problem, setProblem] = useProblem();
 	/** Why there is no reading, also when it was dismissed. */
 	const [failure, setFailure] = useProblem();
-	const [result, setResult] = useState(/** @type {Result | null} */ (null));
+	const [result, setResult] = useState(/** @type {?Result} */ (null));
 	const [look, setLook] = useState(FIRST_LOOK);
 	const [isOpening, setIsOpening] = useState(false);
-	const [reading, setReading] = useState(/** @type {Reading | null} */ (null));
+	const [reading, setReading] = useState(/** @type {?Reading} */ (null));
 	const [marks, setMarks] = useState(/** @type {Pixel[]} */ ([]));
 	const [picture, setPicture] = useState("photograph");
 	const [counts, setCounts] = useState(/** @type {Uint32Array | null} */ (null));
-	const [measured, setMeasured] = useState(/** @type {Measured | null} */ (null));
-	const running = useRef(/** @type {AbortController | null} */ (null));
-	const newest = useRef(/** @type {File | null} */ (null));
+	const [measured, setMeasured] = useState(/** @type {?Measured} */ (null));
+	const running = useRef(/** @type {?AbortController} */ (null));
+	const newest = useRef(/** @type {?File} */ (null));
+	/** The pixel that is read, or else marked: of the next answer it is read, too. */
+	const kept = useRef(/** @type {?Pixel} */ (null));
+	kept.current = reading ?? marks.at(-1) ?? null;
 	/** The camera and revision that was read by before the page knew it. */
 	const ahead = useRef("");
 
 	// who may not list cameras may still read by one that a link names
 	const listed = cameras ?? (lacksCameras && name ? [{ name }] : []);
 	const camera = listed.find((one) => one.name === name) ?? null;
+	const found = listed.filter((one) => one.name.toLowerCase().includes(filter.toLowerCase()));
 	const ask = { camera: name, side, focusM, known };
 
 	useEffect(() => {
@@ -113,6 +118,7 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 		if (!taken) return;
 		setLeftOut(given.length - 1);
 		setResult(null);
+		setProblem(null);
 		setFailure(null);
 		setReading(null);
 		setMarks([]);
@@ -168,15 +174,16 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 
 	/** @param {File} sent @param {AbortSignal} signal @param {number} waitMs */
 	async function run(sent, signal, waitMs) {
-		const show = (/** @type {Phase | null} */ next) => signal.aborted || setPhase(next);
+		const show = (/** @type {?Phase} */ next) => signal.aborted || setPhase(next);
 		setProblem(null);
 		setFailure(null);
 		show({ step: "upload", fraction: 0 });
 		await new Promise((resolve) => setTimeout(resolve, waitMs)); // arrow keys pass by
 		if (signal.aborted) return;
 		announce("Sending the photograph.");
+		let isHeld = true; // the answer before
 		try {
-			const answer = await upload(depthPath({ ...ask, format: "npz" }), {
+			const answer = await upload(`${depthPath({ ...ask, format: "npz" })}&longest_px=${MOST_PX}`, {
 				body: sent,
 				headers: { "Content-Type": mediaTypeOf(sent) },
 				// a Blob: it stays outside the page, and the worker takes its arrays out one by one
@@ -187,8 +194,9 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 				onReceived: (fraction) => show({ step: "receive", fraction }),
 			});
 			show({ step: "draw" });
-			const facts = await reader.ask("load", { npz: answer.body });
-			if (signal.aborted) return;
+			isHeld = false;
+			const { facts, reading: again } = await reader.ask("load", { npz: answer.body, at: kept.current });
+			signal.throwIfAborted();
 			const { spread } = facts;
 			const told = readDepthHeaders(answer.headers);
 			if (spread) setLook((before) => ({ ...before, nearM: spread.nearM, farM: spread.farM }));
@@ -196,12 +204,11 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 				asked: ask,
 				file: sent,
 				facts,
-				npz: answer.body,
 				...told,
 				timings: readTimings(answer.headers.get("Server-Timing") ?? ""),
 				model: answer.headers.get("Camind-Model") ?? "",
 			});
-			setReading(null);
+			setReading(kept.current && again);
 			setMarks((before) => [...before]);
 			setPhase(null);
 			if (told.revision !== camera?.revision) {
@@ -213,17 +220,20 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 				: "The photograph gives no answer";
 			announce([words, ...told.warnings].join(". "));
 		} catch (error) {
+			if (!isHeld) setResult((now) => (now === result ? null : now));
 			if (!signal.aborted) fail(error instanceof Problem ? withSize(error) : unreadable(error));
 		}
 	}
 
-	/** @param {Problem} why */
+	/** @param {Problem} why where the same may fare better later, the answer before it stays */
 	function fail(why) {
 		setPhase(null);
-		setResult(null);
+		if (!why.isPassing) setResult(null);
 		setProblem(why);
 		setFailure(why);
 	}
+
+	const pick = (/** @type {string} */ picked) => go("depth", { camera: picked, replaces: true });
 
 	function cancel() {
 		running.current?.abort();
@@ -242,17 +252,29 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 			<h2 class="visually-hidden">Depth</h2>
 			<div class="depth-ask">
 				<div class="stack depth-camera">
-					<label class="field"
-						>Camera
-						<select
-							value=${camera ? name : ""}
-							aria-invalid=${isNotTheFrame}
-							onChange=${(/** @type {any} */ event) => go("depth", { camera: event.target.value, replaces: true })}
-						>
-							<option value="" disabled selected=${!camera}>${cameras ? "Choose the camera that took it" : lacksCameras ? "The list did not come" : "Loading…"}</option>
-							${listed.map((one) => html`<option key=${one.name} value=${one.name}>${one.name}</option>`)}
-						</select>
-					</label>
+					<div class="pair">
+						<label class="field"
+							>Camera
+							<select
+								value=${camera ? name : ""}
+								aria-invalid=${isNotTheFrame}
+								onChange=${(event) => pick(event.target.value)}
+							>
+								<option value="" disabled selected=${!camera}>${cameras ? "Choose its camera" : lacksCameras ? "The list did not come" : "Loading…"}</option>
+								${(camera && !found.includes(camera) ? [camera, ...found] : found).map((one) => html`<option key=${one.name} value=${one.name}>${one.name}</option>`)}
+							</select>
+						</label>
+						${listed.length > MANY &&
+						html`<label class="field">
+							Find a camera
+							<input
+								type="search"
+								value=${filter}
+								onInput=${(event) => setFilter(event.target.value)}
+								onKeyDown=${({ key }) => key === "Enter" && found[0] && pick(found[0].name)}
+							/>
+						</label>`}
+					</div>
 					${cameras &&
 					(camera
 						? html`<p class="hint">${about(camera)}</p>`
@@ -260,7 +282,7 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 					${cameras?.length === 0 &&
 					html`<p class="hint">
 						No camera is stored yet. Give a photograph, and its EXIF drafts one; or${" "}
-						<button type="button" class="depth-link" onClick=${() => go("cameras")}>make one yourself</button>.
+						<button class="depth-link" onClick=${() => go("cameras")}>make one yourself</button>.
 					</p>`}
 					<${Warnings} texts=${warned("camera")} />
 				</div>
@@ -270,7 +292,7 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 						...${{ id: "depth-focus", label: "Focus distance of this shot, m", kind: "decimal", value: focus, onInput: setFocus }}
 						fault=${toMetres(focus) === undefined ? "This is no distance in metres." : ""}
 						hint=${camera && cameras ? `Left empty, the camera's: ${short(camera.focus_distance_m, 4)} m.` : ""}
-						onChange=${(/** @type {string} */ text) => toMetres(text) !== undefined && setFocusM(toMetres(text) ?? null)}
+						onChange=${(text) => toMetres(text) !== undefined && setFocusM(toMetres(text) ?? null)}
 					/>
 					<${Warnings} texts=${warned("focus")} />
 				</div>
@@ -287,7 +309,7 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 			!isDrafting &&
 			html`<p>
 				If it is the whole frame of another camera,${" "}
-				<button type="button" class="depth-link" onClick=${() => setIsDrafting(true)}>draft a camera from this photograph</button>.
+				<button class="depth-link" onClick=${() => setIsDrafting(true)}>draft a camera from this photograph</button>.
 				From a crop every depth would be wrong.
 			</p>`}
 			${wantsDraft &&
@@ -296,17 +318,17 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 				file=${file}
 				mediaType=${mediaTypeOf(/** @type {File} */ (file))}
 				onFailed=${setFailure}
-				onStored=${async (/** @type {any} */ stored) => {
+				onStored=${async (stored) => {
 					await reloadCameras({ stored });
 					setProblem(null);
-					go("depth", { camera: stored.name, replaces: true });
+					pick(stored.name);
 				}}
 			/>`}
 			${failure &&
 			!problem &&
 			file &&
 			camera &&
-			html`<div class="row"><button type="button" class="primary" onClick=${again}>Read the depth</button></div>`}
+			html`<div class="row"><button class="primary" onClick=${again}>Read the depth</button></div>`}
 			<${Progress} phase=${phase} onCancel=${cancel} />
 			${file &&
 			html`<p class="hint">
@@ -317,6 +339,11 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 				? html`<${DropPlace} ...${{ file, isOpening }} isRefused=${failure && NO_PHOTOGRAPH.test(failure.type)} />`
 				: html`<div class=${`depth-grid ${phase && result ? "depth-stale" : ""}`}>
 						<div class="stack">
+							${failure &&
+							result &&
+							html`<p class="notice">
+								Still shown is the answer before: camera ${result.asked.camera}, side ${result.asked.side}, focused at ${short(result.focusM, 4)} m.
+							</p>`}
 							${result &&
 							html`<${PictureTabs} picture=${picture} onPicture=${setPicture} />`}
 							<div
@@ -404,17 +431,17 @@ function DropPlace({ file, isOpening, isRefused }) {
 
 /** @param {{hasFile: boolean, onFiles: (files: FileList) => void}} props */
 function FileButtons({ hasFile, onFiles }) {
-	const chosen = useRef(/** @type {HTMLInputElement | null} */ (null));
-	const taken = useRef(/** @type {HTMLInputElement | null} */ (null));
+	const chosen = useRef(/** @type {?HTMLInputElement} */ (null));
+	const taken = useRef(/** @type {?HTMLInputElement} */ (null));
 	const onChange = (/** @type {any} */ { target }) => {
 		onFiles(target.files);
 		target.value = ""; // the same file may be chosen again
 	};
 	return html`<div class="row depth-files">
-		<button type="button" class=${hasFile ? "" : "primary"} onClick=${() => chosen.current?.click()}>
+		<button class=${hasFile ? "" : "primary"} onClick=${() => chosen.current?.click()}>
 			${hasFile ? "Another photograph" : "Choose a photograph"}
 		</button>
-		<button type="button" class="depth-take" onClick=${() => taken.current?.click()}>Take one</button>
+		<button class="depth-take" onClick=${() => taken.current?.click()}>Take one</button>
 		<input ref=${chosen} type="file" accept=${PHOTOGRAPHS} hidden onChange=${onChange} />
 		<input ref=${taken} type="file" accept="image/*" capture="environment" hidden onChange=${onChange} />
 	</div>`;
@@ -433,7 +460,6 @@ function PictureTabs({ picture, onPicture }) {
 		${["photograph", "cloud"].map(
 			(tab) => html`<button
 				key=${tab}
-				type="button"
 				id=${`depth-tab-${tab}`}
 				role="tab"
 				aria-selected=${tab === picture}
@@ -463,7 +489,7 @@ function Progress({ phase, onCancel }) {
 	return html`<div class="depth-progress">
 		<progress key=${phase.step} aria-label="Progress" value=${fraction ?? undefined}></progress>
 		<span>${STEPS[phase.step]}${part}${time}</span>
-		<button type="button" onClick=${onCancel}>Cancel</button>
+		<button onClick=${onCancel}>Cancel</button>
 	</div>`;
 }
 

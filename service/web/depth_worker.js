@@ -2,9 +2,9 @@
 
 import { DepthMaps } from "./maps.js";
 
-/** @type {DepthMaps | null} */
+/** @type {?DepthMaps} */
 let maps = null;
-/** @type {ImageData | null} */
+/** @type {?ImageData} */
 let photograph = null;
 
 function loaded() {
@@ -13,11 +13,11 @@ function loaded() {
 }
 
 const WORK = {
-	/** @param {{npz: Blob}} about */
-	async load({ npz }) {
+	/** @param {{npz: Blob, at: {u: number, v: number} | null}} about */
+	async load({ npz, at }) {
 		maps = null; // two photographs' maps at a time may be more than a phone has
 		maps = await DepthMaps.read(npz);
-		return maps.facts();
+		return { facts: maps.facts(), reading: at && maps.at(at.u, at.v) };
 	},
 
 	/**

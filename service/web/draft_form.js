@@ -68,7 +68,7 @@ export function DraftForm({ file, mediaType, onStored, onFailed }) {
 		html`<${Field}
 			...${{ path, label, hint, kind, form: "draft", value: fields[path] ?? "" }}
 			faults=${[...faults, ...(problem?.errors ?? [])]}
-			onChange=${(/** @type {any} */ changed) => {
+			onChange=${(changed) => {
 				setFields((before) => ({ ...before, ...changed }));
 				setProblem(null);
 			}}
@@ -79,13 +79,13 @@ export function DraftForm({ file, mediaType, onStored, onFailed }) {
 			${draft.image_width_px} × ${draft.image_height_px} px${draft.description && `, ${draft.description}`}. Choose a stored
 			camera above, or complete this one. The real focal length, never the 35-mm equivalent.
 		</p>
-		<div class="depth-draft">
+		<div class="pair">
 			${field("name", "Name", "", "text")} ${NUMBERS.map(([path, label, hint]) => field(path, label, hint))}
 		</div>
 		<${Warnings} texts=${draft.warnings} />
 		<${ProblemBox} problem=${problem} />
 		<div class="row">
-			<button type="submit" class="primary" disabled=${missing.length + faults.length > 0}>
+			<button class="primary" disabled=${missing.length + faults.length > 0}>
 				Store the camera and read the depth
 			</button>
 			${missing.length > 0 && html`<span class="hint">Fill in ${missing.join(", ")} first.</span>`}

@@ -9,7 +9,7 @@ import { Choice } from "./text_field.js";
 import { html, useState } from "./vendor/preact.js";
 
 /** @param {{result: import("./depth.js").Result, announce: (text: string) => void, onChanged: () => void}} props */
-export function Exports({ result: { asked, file, npz, revision, warnings }, announce, onChanged }) {
+export function Exports({ result: { asked, file, revision, warnings }, announce, onChanged }) {
 	const [format, setFormat] = useState("png");
 	const [isBusy, setIsBusy] = useState(false);
 	const [problem, setProblem] = useProblem();
@@ -25,7 +25,7 @@ export function Exports({ result: { asked, file, npz, revision, warnings }, anno
 		setProblem(null);
 		setTold([]);
 		try {
-			const got = format === "npz" ? { body: npz, told: [] } : await ask();
+			const got = await ask();
 			setTold(got.told);
 			if (got.body) save(got.body, answer);
 			announce([...(got.body ? [`${answer} is downloaded`] : []), ...got.told].join(". "));
@@ -69,16 +69,16 @@ export function Exports({ result: { asked, file, npz, revision, warnings }, anno
 			label="Format"
 			value=${format}
 			options=${Object.entries(FORMATS)}
-			onChange=${(/** @type {string} */ value) => {
+			onChange=${(value) => {
 				setFormat(value);
 				setCopied(null);
 			}}
 		/>
 		<div class="row">
-			<button type="button" onClick=${download}>${isBusy ? "Asking…" : "Download"}</button>
-			<button type="button" onClick=${() => copy(curlCommand)}>Copy as curl</button>
-			<button type="button" onClick=${() => copy(pythonCommand)}>Copy as Python</button>
-			<button type="button" onClick=${() => print()}>Print</button>
+			<button onClick=${download}>${isBusy ? "Asking…" : "Download"}</button>
+			<button onClick=${() => copy(curlCommand)}>Copy as curl</button>
+			<button onClick=${() => copy(pythonCommand)}>Copy as Python</button>
+			<button onClick=${() => print()}>Print</button>
 		</div>
 		<${ProblemBox} problem=${problem} onClose=${() => setProblem(null)} />
 		<${Warnings} texts=${told} />

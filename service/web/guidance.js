@@ -10,9 +10,9 @@ import { upright } from "./photograph_files.js";
  * @property {number} height
  * @property {number} orientation of EXIF
  * @property {{u_px: number, v_px: number, radius_px: number}[]} circles
- * @property {number | null} blur in px
- * @property {number | null} distance in metres
- * @property {number | null} tilt in degrees
+ * @property {?number} blur in px
+ * @property {?number} distance in metres
+ * @property {?number} tilt in degrees
  */
 
 export const WANTED = 8;
@@ -54,7 +54,7 @@ export function coverageOf(seen) {
 	return cells;
 }
 
-/** Where the lens seems to be focused: as told, else the distance of the sharpest photograph. @param {Seen[]} seen @param {number | null} told */
+/** Where the lens seems to be focused: as told, else the distance of the sharpest photograph. @param {Seen[]} seen @param {?number} told */
 export function focusOf(seen, told) {
 	if (told !== null) return told;
 	const known = seen.filter(({ role, blur, distance }) => role === "defocused" && blur !== null && distance !== null);
@@ -62,7 +62,7 @@ export function focusOf(seen, told) {
 	return known[0]?.distance ?? null;
 }
 
-/** @param {Seen[]} seen @param {number | null} toldFocus in metres @returns {string} */
+/** @param {Seen[]} seen @param {?number} toldFocus in metres @returns {string} */
 export function adviceFor(seen, toldFocus) {
 	const left = WANTED - seen.length;
 	const tilted = seen.filter(({ tilt }) => tilt !== null && tilt >= TILTED_DEG).length;
@@ -83,7 +83,7 @@ export function adviceFor(seen, toldFocus) {
 	return "This is a good set: start the calibration.";
 }
 
-/** @param {Seen[]} seen @param {number | null} focus in metres @returns {string | null} where too few were taken */
+/** @param {Seen[]} seen @param {?number} focus in metres @returns {?string} where too few were taken */
 function missingSide(seen, focus) {
 	const defocused = seen.filter(({ role }) => role === "defocused");
 	const distances = defocused.flatMap(({ distance }) => (distance === null ? [] : [distance]));
@@ -131,7 +131,7 @@ function within([low, high], reach) {
 		: [Math.min(low, 1 + reach / 2), Math.min(high, 1 + reach)];
 }
 
-/** @param {Seen[]} seen @returns {string | null} what to take where all are blurred alike, which tells k_cam no more than one */
+/** @param {Seen[]} seen @returns {?string} what to take where all are blurred alike, which tells k_cam no more than one */
 function missingBlur(seen) {
 	const blurs = seen.flatMap(({ role, blur }) => (role === "defocused" && blur !== null ? [blur] : []));
 	if (blurs.length === 0) return null;
@@ -147,7 +147,7 @@ function sizeOf({ circles, width }) {
 	return Math.hypot(Math.max(...across) - Math.min(...across), Math.max(...down) - Math.min(...down)) / width;
 }
 
-/** @param {number[][]} cells @returns {string | null} the first corner without a circle */
+/** @param {number[][]} cells @returns {?string} the first corner without a circle */
 function missingCorner(cells) {
 	const [top, bottom, last] = [cells[0], cells[cells.length - 1], cells[0].length - 1];
 	const corners = /** @type {[string, number[], number[]][]} */ ([

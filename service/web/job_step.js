@@ -31,7 +31,7 @@ export function Running({ job }) {
 		<div class="card">
 			<div class="row ends">
 				<h3>${job.state === "queued" ? `The calibration of ${job.camera} waits` : `Calibrating ${job.camera}`}</h3>
-				<button type="button" class="danger" onClick=${cancel}>Cancel</button>
+				<button class="danger" onClick=${cancel}>Cancel</button>
 			</div>
 			<progress max="1" value=${job.progress} aria-label="Progress of the calibration"></progress>
 			<p class="hint">
@@ -75,7 +75,7 @@ export function Ended({ job, cameras, onAccepted, onDiscard, onAgain, go }) {
 				<h3>${job.state === "cancelled" ? "The calibration was cancelled" : "The calibration found no camera"}</h3>
 				${job.problem && html`<div class="problem" role="alert"><p>${job.problem}</p></div>`}
 				<${Images} images=${job.images} />
-				<div class="row"><button type="button" class="primary" onClick=${onAgain}>Back to the photographs</button></div>
+				<div class="row"><button class="primary" onClick=${onAgain}>Back to the photographs</button></div>
 			</div>
 		`;
 	}
@@ -190,7 +190,7 @@ function Residuals({ result: { samples, curve } }) {
 	/>`;
 }
 
-/** The service's curve between two of its points. @param {any[]} curve @param {number} depth @returns {number | null} */
+/** The service's curve between two of its points. @param {any[]} curve @param {number} depth @returns {?number} */
 function curveAt(curve, depth) {
 	const after = curve.findIndex(({ depth_m: at }) => at >= depth);
 	if (after < 1) return null;
@@ -243,9 +243,9 @@ function Accept({ job, cameras, isVague, onAccepted, onDiscard, onAgain, go }) {
 		return html`
 			<p><span class="badge good">stored</span> as revision ${job.camera_revision} of camera ${job.camera}.</p>
 			<div class="row">
-				<button type="button" class="primary" onClick=${() => go("depth", { camera: job.camera })}>Measure depth with it</button>
-				<button type="button" onClick=${() => go("cameras", { camera: job.camera })}>See the camera</button>
-				<button type="button" onClick=${onDiscard}>Another calibration</button>
+				<button class="primary" onClick=${() => go("depth", { camera: job.camera })}>Measure depth with it</button>
+				<button onClick=${() => go("cameras", { camera: job.camera })}>See the camera</button>
+				<button onClick=${onDiscard}>Another calibration</button>
 			</div>
 		`;
 	}

@@ -6,10 +6,10 @@ import { html, useEffect, useRef, useState } from "./vendor/preact.js";
 /** @typedef {{reason: string | null, answer: (key: string | null) => void}} Question */
 
 export function KeyDialog() {
-	const [question, setQuestion] = useState(/** @type {Question | null} */ (null));
-	const [fault, setFault] = useState(/** @type {string | null} */ (null));
-	const dialog = useRef(/** @type {HTMLDialogElement | null} */ (null));
-	const input = useRef(/** @type {HTMLInputElement | null} */ (null));
+	const [question, setQuestion] = useState(/** @type {?Question} */ (null));
+	const [fault, setFault] = useState(/** @type {?string} */ (null));
+	const dialog = useRef(/** @type {?HTMLDialogElement} */ (null));
+	const input = useRef(/** @type {?HTMLInputElement} */ (null));
 
 	useEffect(() => {
 		setKeyAsker((reason) => new Promise((resolve) => setQuestion({ reason, answer: resolve })));
@@ -21,7 +21,7 @@ export function KeyDialog() {
 		input.current?.focus();
 	}, [question]);
 
-	/** @param {string | null} key */
+	/** @param {?string} key */
 	function answer(key) {
 		if (input.current) input.current.value = "";
 		dialog.current?.close();

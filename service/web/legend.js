@@ -8,7 +8,7 @@ import { html, useEffect, useRef } from "./vendor/preact.js";
 /** @param {{look: import("./maps.js").Look, counts: Uint32Array | null}} props */
 export function Legend({ look, counts }) {
 	const { map, nearM, farM, hatchesNothing, dotsEither } = look;
-	const bar = useRef(/** @type {HTMLCanvasElement | null} */ (null));
+	const bar = useRef(/** @type {?HTMLCanvasElement} */ (null));
 	useEffect(() => {
 		const context = bar.current?.getContext("2d");
 		if (!context) return;

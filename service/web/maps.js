@@ -11,18 +11,18 @@ import { readNpz } from "./npy.js";
  * @typedef {object} Reading
  * @property {number} u
  * @property {number} v
- * @property {number | null} depthM
- * @property {number | null} otherM the depth on the other side of the plane in focus
- * @property {number | null} sigmaM
+ * @property {?number} depthM
+ * @property {?number} otherM the depth on the other side of the plane in focus
+ * @property {?number} sigmaM
  * @property {number} pNear
  * @property {number} blurPx
- * @property {number | null} rayLength metres straight from the lens per metre of depth along its axis; null where the
+ * @property {?number} rayLength metres straight from the lens per metre of depth along its axis; null where the
  *   camera's focal length is not known, or no ray meets the pixel
  */
 
 /**
  * @typedef {object} Facts
- * @property {number} width
+ * @property {number} width of the photograph, in whose pixels places are told
  * @property {number} height
  * @property {boolean} hasPoints whether the camera's focal length is known, without which a pixel has no direction
  * @property {number} validShare
@@ -55,28 +55,35 @@ const LEAST_STEP = 1e-3;
 const MOST_OFF_PX = 0.5;
 
 export class DepthMaps {
-	/** @param {Map<string, import("./npy.js").NumpyArray>} arrays */
-	constructor(arrays) {
+	/**
+	 * @param {Map<string, import("./npy.js").NumpyArray>} arrays
+	 * @param {{image_width_px?: number, image_height_px?: number}} [about] the photograph, if it is larger than its maps
+	 */
+	constructor(arrays, about = {}) {
 		const take = (/** @type {string} */ name) => {
 			const found = arrays.get(name);
 			if (!found) throw new Error(`The answer lacks ${name}.`);
 			return found.data;
 		};
 		this.depthM = take("depth_m");
-		this.width = arrays.get("depth_m")?.shape[1] ?? 0;
-		this.height = this.depthM.length / this.width;
+		this.columns = arrays.get("depth_m")?.shape[1] ?? 0;
+		this.rows = this.depthM.length / this.columns;
+		this.width = about.image_width_px ?? this.columns;
+		this.height = about.image_height_px ?? this.rows;
 		this.otherM = take("depth_alt_m");
 		this.pNear = take("p_near");
 		this.sigmaM = take("sigma_m");
 		this.blurPx = take("blur_px");
 		const [fx, , cx, , fy, cy] = take("K");
-		this.lens = { fx, fy, cx, cy };
+		const [across, down] = [this.width / this.columns, this.height / this.rows];
+		this.lens = { fx: fx * across, fy: fy * down, cx: (cx + 0.5) * across - 0.5, cy: (cy + 0.5) * down - 0.5 };
 		this.distortion = Array.from(arrays.get("distortion")?.data ?? []);
 	}
 
 	/** @param {Blob} npz */
 	static async read(npz) {
-		return new DepthMaps(await readNpz(npz));
+		const { arrays, comment } = await readNpz(npz);
+		return new DepthMaps(arrays, JSON.parse(comment));
 	}
 
 	get hasPoints() {
@@ -115,9 +122,15 @@ export class DepthMaps {
 		return pNear > EITHER[0] && pNear < EITHER[1] && (ratio > APART || ratio < 1 / APART);
 	}
 
+	/** @param {number} u @param {number} v @returns {number} where in the maps a pixel of the photograph is */
+	indexOf(u, v) {
+		const [row, column] = [((v + 0.5) * this.rows) / this.height, ((u + 0.5) * this.columns) / this.width];
+		return Math.floor(row) * this.columns + Math.floor(column);
+	}
+
 	/** @param {number} u @param {number} v @returns {Reading} */
 	at(u, v) {
-		const pixel = v * this.width + u;
+		const pixel = this.indexOf(u, v);
 		const known = (/** @type {number} */ value) => (Number.isFinite(value) ? value : null);
 		return {
 			u,
@@ -141,7 +154,7 @@ export class DepthMaps {
 	 */
 	distance(from, to) {
 		const ends = [from, to].map(({ u, v }) => {
-			const pixel = v * this.width + u;
+			const pixel = this.indexOf(u, v);
 			const [ray, depth] = [this.ray(u, v) ?? [NaN, NaN, NaN], this.depthM[pixel]];
 			return { ray, sigma: this.sigmaM[pixel], point: ray.map((part) => part * depth) };
 		});
@@ -182,11 +195,11 @@ export class DepthMaps {
 		const pixels = new ImageData(width, height);
 		const words = new Uint32Array(pixels.data.buffer);
 		const counts = new Uint32Array(BINS);
-		const columns = Uint32Array.from({ length: width }, (_, x) => Math.floor(((x + 0.5) * this.width) / width));
+		const columns = Uint32Array.from({ length: width }, (_, x) => Math.floor(((x + 0.5) * this.columns) / width));
 		const scale = 1 / Math.log(farM / nearM);
 		const logNear = Math.log(nearM);
 		for (let y = 0, to = 0; y < height; y++) {
-			const row = Math.floor(((y + 0.5) * this.height) / height) * this.width;
+			const row = Math.floor(((y + 0.5) * this.rows) / height) * this.columns;
 			for (let x = 0; x < width; x++, to++) {
 				const from = row + columns[x];
 				const depth = this.depthM[from];
@@ -215,13 +228,14 @@ export class DepthMaps {
 	 *
 	 * @param {number} most
 	 * @param {Look} look
-	 * @param {ImageData | null} photograph whose colours the points get; null: those of their depths
+	 * @param {?ImageData} photograph whose colours the points get; null: those of their depths
 	 * @returns {{positions: Float32Array, colours: Uint8Array, centre: number[], spacing: number}} `spacing` is that of
 	 *   neighbours at 1 m
 	 */
 	cloud(most, look, photograph) {
-		const step = Math.max(1, Math.sqrt((this.width * this.height) / most));
-		const [columns, rows] = [Math.floor(this.width / step), Math.floor(this.height / step)];
+		const step = Math.max(1, Math.sqrt(this.depthM.length / most));
+		const [columns, rows] = [Math.floor(this.columns / step), Math.floor(this.rows / step)];
+		const [across, down] = [this.width / this.columns, this.height / this.rows];
 		const positions = new Float32Array(3 * columns * rows);
 		const colours = new Uint8Array(3 * columns * rows);
 		const table = colourTable(look.map);
@@ -230,14 +244,14 @@ export class DepthMaps {
 			const v = Math.floor((row + 0.5) * step);
 			for (let column = 0; column < columns; column++) {
 				const u = Math.floor((column + 0.5) * step);
-				const depth = this.depthM[v * this.width + u];
+				const depth = this.depthM[v * this.columns + u];
 				if (!(depth > 0)) continue;
-				const ray = this.ray(u, v);
+				const ray = this.ray((u + 0.5) * across - 0.5, (v + 0.5) * down - 0.5);
 				if (ray === null) continue;
 				for (let axis = 0; axis < 3; axis++) positions[3 * count + axis] = ray[axis] * depth;
 				if (photograph) {
-					const x = Math.floor(((u + 0.5) * photograph.width) / this.width);
-					const y = Math.floor(((v + 0.5) * photograph.height) / this.height);
+					const x = Math.floor(((u + 0.5) * photograph.width) / this.columns);
+					const y = Math.floor(((v + 0.5) * photograph.height) / this.rows);
 					const from = 4 * (y * photograph.width + x);
 					colours.set(photograph.data.subarray(from, from + 3), 3 * count);
 				} else {
@@ -253,7 +267,7 @@ export class DepthMaps {
 			positions: positions.slice(0, 3 * count),
 			colours: colours.slice(0, 3 * count),
 			centre: count > 0 ? [middle(0), middle(1), middle(2)] : [0, 0, 1],
-			spacing: step / this.lens.fx,
+			spacing: (step * across) / this.lens.fx,
 		};
 	}
 }

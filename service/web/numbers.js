@@ -9,7 +9,7 @@ export function short(value, digits = 3) {
 	return String(Number(value.toPrecision(digits)));
 }
 
-/** @param {number | null} value @param {string} unit with the space before it, where there is one @param {number} [digits] */
+/** @param {?number} value @param {string} unit with the space before it, where there is one @param {number} [digits] */
 export function measure(value, unit, digits = 3) {
 	return value === null ? "–" : short(value, digits) + unit;
 }
@@ -20,7 +20,7 @@ export function inMetres(value, like = value) {
 	return value.toFixed(isClose ? CLOSE_DIGITS - 1 - Math.floor(Math.log10(like)) : 3);
 }
 
-/** @param {number} depthM @param {number | null} sigmaM */
+/** @param {number} depthM @param {?number} sigmaM */
 export function withError(depthM, sigmaM) {
 	return `${inMetres(depthM)} m ± ${inMetres(sigmaM ?? 0, depthM)} m`;
 }

@@ -52,7 +52,7 @@ export function useLooks(photos, setPhotos, query) {
 	useEffect(() => {
 		if (!next || !query) return undefined;
 		const stop = new AbortController();
-		const tell = (/** @type {any} */ look, /** @type {Problem | null} */ problem = null) =>
+		const tell = (/** @type {any} */ look, /** @type {?Problem} */ problem = null) =>
 			setPhotos((before) => before.map((one) => (one.id === next.id ? { ...one, look, problem, asked: query } : one)));
 		lookAt(next.file, query, asks, stop.signal).then(tell, (error) => stop.signal.aborted || tell(null, problemOf(error)));
 		return () => stop.abort();
@@ -103,7 +103,7 @@ export function Photographs({ photos, query, focus, onChange, announce }) {
 
 	return html`
 		<div class="columns">
-			${ROLES.map((one) => html`<${DropZone} key=${one.role} ...${one} onFiles=${(/** @type {File[]} */ files) => add(files, one.role)} />`)}
+			${ROLES.map((one) => html`<${DropZone} key=${one.role} ...${one} onFiles=${(files) => add(files, one.role)} />`)}
 		</div>
 		<div class="notice next">
 			<p>
@@ -121,7 +121,7 @@ export function Photographs({ photos, query, focus, onChange, announce }) {
 					photo=${photo}
 					isLooking=${photo.asked !== query}
 					hasPartner=${hasPartner(photo, photos)}
-					onRole=${(/** @type {Role} */ role) => onChange((before) => before.map((one) => (one.id === photo.id ? { ...one, role } : one)))}
+					onRole=${(role) => onChange((before) => before.map((one) => (one.id === photo.id ? { ...one, role } : one)))}
 					onAgain=${() => onChange((before) => before.map((one) => (one.id === photo.id || one.problem?.isPassing ? { ...one, asked: "", problem: null } : one)))}
 					onRemove=${() => onChange((before) => before.filter(({ id }) => id !== photo.id))}
 				/>`,
@@ -149,21 +149,21 @@ function hasPartner(photo, photos) {
 
 /** @param {{role: Role, title: string, words: string, onFiles: (files: File[]) => void}} props */
 function DropZone({ role, title, words, onFiles }) {
-	const input = useRef(/** @type {HTMLInputElement | null} */ (null));
+	const input = useRef(/** @type {?HTMLInputElement} */ (null));
 	const [isOver, setIsOver] = useState(false);
 	return html`
 		<div
 			class=${`drop ${isOver ? "over" : ""}`}
 			onDragOver=${() => setIsOver(true)}
 			onDragLeave=${() => setIsOver(false)}
-			onDrop=${(/** @type {any} */ { dataTransfer }) => {
+			onDrop=${({ dataTransfer }) => {
 				setIsOver(false);
 				onFiles([...dataTransfer.files]);
 			}}
 		>
 			<h3>${title}</h3>
 			<p class="hint">${words}</p>
-			<button type="button" aria-label=${`Choose photographs: ${title}`} onClick=${() => input.current?.click()}>Choose photographs</button>
+			<button aria-label=${`Choose photographs: ${title}`} onClick=${() => input.current?.click()}>Choose photographs</button>
 			<span class="hint">or drop them here</span>
 			<input
 				ref=${input}
@@ -195,7 +195,7 @@ function PhotoCard({ photo, isLooking, hasPartner: partner, onRole, onAgain, onR
 			</div>
 			${problem &&
 			html`<p class="fault">${problem.title} ${problem.detail}</p>
-				${!isLooking && html`<button type="button" onClick=${onAgain}>Look again</button>`}`}
+				${!isLooking && html`<button onClick=${onAgain}>Look again</button>`}`}
 			${look?.found &&
 			html`<dl class="facts">
 				<dt>Blur</dt><dd>${measure(look.blur_px, " px")}</dd>
@@ -210,11 +210,11 @@ function PhotoCard({ photo, isLooking, hasPartner: partner, onRole, onAgain, onR
 				<select
 					aria-label=${`How ${file.name} was focused`}
 					value=${role}
-					onChange=${(/** @type {any} */ event) => onRole(/** @type {Role} */ (event.target.value))}
+					onChange=${(event) => onRole(/** @type {Role} */ (event.target.value))}
 				>
 					${ROLES.map((one) => html`<option value=${one.role}>${one.title}</option>`)}
 				</select>
-				<button type="button" class="quiet" aria-label=${`Remove ${file.name}`} onClick=${onRemove}>Remove</button>
+				<button class="quiet" aria-label=${`Remove ${file.name}`} onClick=${onRemove}>Remove</button>
 			</div>
 		</li>
 	`;
@@ -231,10 +231,10 @@ function statusOf({ look, problem }, isLooking) {
 
 /** The photograph upright and small, with the circles over it. @param {{file: File, look: any | null}} props */
 function Thumb({ file, look }) {
-	const canvas = useRef(/** @type {HTMLCanvasElement | null} */ (null));
-	const [bitmap, setBitmap] = useState(/** @type {ImageBitmap | null} */ (null));
+	const canvas = useRef(/** @type {?HTMLCanvasElement} */ (null));
+	const [bitmap, setBitmap] = useState(/** @type {?ImageBitmap} */ (null));
 	useEffect(() => {
-		let made = /** @type {ImageBitmap | null} */ (null);
+		let made = /** @type {?ImageBitmap} */ (null);
 		let isGone = false;
 		readShown(file, THUMB_PX, (shown) =>
 			createImageBitmap(shown, { resizeWidth: THUMB_PX, resizeQuality: "medium" }).catch(() => null),
@@ -255,7 +255,7 @@ function Thumb({ file, look }) {
 	return html`<canvas ref=${canvas} role="img" aria-label=${words}></canvas>`;
 }
 
-/** @param {HTMLCanvasElement} canvas @param {ImageBitmap | null} bitmap @param {any | null} look */
+/** @param {HTMLCanvasElement} canvas @param {?ImageBitmap} bitmap @param {?any} look */
 function draw(canvas, bitmap, look) {
 	const isTurned = look !== null && look.orientation > 4;
 	const [width, height] = look ? (isTurned ? [look.height_px, look.width_px] : [look.width_px, look.height_px]) : [4, 3];

@@ -38,9 +38,9 @@ export function Warnings({ texts }) {
 	</ul>`;
 }
 
-export const useProblem = () => useState(/** @type {import("./api.js").Problem | null} */ (null));
+export const useProblem = () => useState(/** @type {?import("./api.js").Problem} */ (null));
 
-/** @param {import("./api.js").Problem | null} problem whose wait is counted down, in seconds */
+/** @param {?import("./api.js").Problem} problem whose wait is counted down, in seconds */
 function useCountdown(problem) {
 	const [waitS, setWaitS] = useState(0);
 	useEffect(() => {

@@ -14,7 +14,7 @@ export class DepthReader {
 			if (failure === undefined) resolve(result);
 			else reject(new Error(failure));
 		};
-		/** @type {Error | null} */
+		/** @type {?Error} */
 		this.fault = null;
 		this.worker.onerror = () => {
 			const fault = (this.fault = new Error("A part of the page did not come: load it again."));

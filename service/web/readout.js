@@ -65,7 +65,7 @@ export function Distance({ marks, measured, hasPoints, onClear }) {
 				</p>`
 			: html`<p class="hint">${says()}</p>`}
 		${marks.length > 0 &&
-		html`<div class="row"><button type="button" onClick=${onClear}>Clear points</button></div>`}
+		html`<div class="row"><button onClick=${onClear}>Clear points</button></div>`}
 	</section>`;
 }
 

@@ -71,12 +71,12 @@ export function SheetStep({ sheet, onChange, onNext }) {
 		<${TextField}
 			...${{ id: `sheet-${name}`, label, value: sheet[name], kind: "decimal", fault: fault(name), hint: words }}
 			invalid=${fault(name) !== "" || (name === "ruler_mm" && !hasScale)}
-			onInput=${(/** @type {string} */ value) => onChange({ ...sheet, [name]: value })}
+			onInput=${(value) => onChange({ ...sheet, [name]: value })}
 		/>
 	`;
 
 	const choice = (/** @type {"paper" | "kind"} */ name, /** @type {string} */ label, /** @type {string[][]} */ options) => html`
-		<${Choice} ...${{ label, options, value: sheet[name] }} onChange=${(/** @type {string} */ value) => onChange({ ...sheet, [name]: value })} />
+		<${Choice} ...${{ label, options, value: sheet[name] }} onChange=${(value) => onChange({ ...sheet, [name]: value })} />
 	`;
 
 	/** @param {"pdf" | "svg"} kind */
@@ -99,8 +99,8 @@ export function SheetStep({ sheet, onChange, onNext }) {
 					<li>Glue the sheet to something flat.</li>
 				</ol>
 				<div class="row">
-					<button type="button" class="primary" disabled=${isNone} onClick=${() => download("pdf")}>Download PDF</button>
-					<button type="button" disabled=${isNone} onClick=${() => download("svg")}>Download SVG</button>
+					<button class="primary" disabled=${isNone} onClick=${() => download("pdf")}>Download PDF</button>
+					<button disabled=${isNone} onClick=${() => download("svg")}>Download SVG</button>
 				</div>
 				<${ProblemBox} problem=${failed} />
 				${field("ruler_mm", "Measure this: the printed ruler is ... mm long", hasScale ? "" : "Between 50 and 200 mm.")}
@@ -118,9 +118,7 @@ export function SheetStep({ sheet, onChange, onNext }) {
 				</details>
 				${isNone && !problem.errors.length && html`<p class="fault" role="alert">${problem.detail}</p>`}
 				<div class="row">
-					<button type="button" class="primary" disabled=${!hasScale || isNone} onClick=${onNext}>
-						Next: photographs
-					</button>
+					<button class="primary" disabled=${!hasScale || isNone} onClick=${onNext}>Next: photographs</button>
 				</div>
 			</div>
 			<figure class="card sheet">
@@ -140,7 +138,7 @@ function queryOf({ kind, rows, columns, spacing_mm, diameter_mm, paper }) {
 
 /** @param {Sheet} sheet @returns {{picture: string | null, problem: Problem | null}} */
 function usePicture(sheet) {
-	const [state, setState] = useState({ picture: /** @type {string | null} */ (null), problem: /** @type {Problem | null} */ (null) });
+	const [state, setState] = useState({ picture: /** @type {?string} */ (null), problem: /** @type {?Problem} */ (null) });
 	const query = String(queryOf(sheet));
 	useEffect(() => {
 		const stop = new AbortController();

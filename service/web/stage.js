@@ -38,7 +38,7 @@ export function Stage(props) {
 	const { onReading, onMarks, onCounts, announce } = props;
 	const [stage, width] = useWidth(0);
 	const [divider, setDivider] = useState(0);
-	const [painted, setPainted] = useState(/** @type {ImageBitmap | null} */ (null));
+	const [painted, setPainted] = useState(/** @type {?ImageBitmap} */ (null));
 	// as wide as it is shown, in the screen's pixels
 	const most = (MOST_PX * size.width) / Math.max(size.width, size.height);
 	const paintPx = Math.round(Math.min(most, width * devicePixelRatio));
@@ -63,7 +63,7 @@ export function Stage(props) {
 	}, [result, look, paintPx]);
 
 	const read = useMemo(
-		() => latest(async (/** @type {Pixel | null} */ pixel) => onReading(pixel && (await reader.ask("at", pixel)))),
+		() => latest(async (/** @type {?Pixel} */ pixel) => onReading(pixel && (await reader.ask("at", pixel)))),
 		[],
 	);
 
@@ -157,7 +157,7 @@ export function Stage(props) {
 			onPointerDown=${onPointerDown}
 			onPointerMove=${onPointerMove}
 			onPointerUp=${onPointerUp}
-			onPointerLeave=${(/** @type {PointerEvent} */ event) =>
+			onPointerLeave=${(event) =>
 				event.pointerType === "mouse" && !isByKeys.current && result && read(marks.at(-1) ?? null)}
 			onKeyDown=${onKeyDown}
 		>
@@ -178,7 +178,7 @@ export function Stage(props) {
 					max="100"
 					value=${divider}
 					aria-label="Part of the picture that shows the photograph"
-					onInput=${(/** @type {any} */ event) => setDivider(Number(event.target.value))}
+					onInput=${(event) => setDivider(Number(event.target.value))}
 				/><span>Photograph</span></label
 			>
 			<p id=${HINT} class="hint">
@@ -190,7 +190,7 @@ export function Stage(props) {
 
 /** @param {{bitmap: ImageBitmap | null, name: string}} props */
 function Bitmap({ bitmap, name }) {
-	const canvas = useRef(/** @type {HTMLCanvasElement | null} */ (null));
+	const canvas = useRef(/** @type {?HTMLCanvasElement} */ (null));
 	useEffect(() => {
 		if (!bitmap || !canvas.current) return;
 		canvas.current.width = bitmap.width;

@@ -16,8 +16,8 @@ import { html, useEffect, useState } from "./vendor/preact.js";
  * @property {any | Problem | null} ready
  * @property {any | Problem | null} model
  * @property {Sample[] | Problem | null} samples
- * @property {string | null} key it looked with
- * @property {Date | null} at
+ * @property {?string} key it looked with
+ * @property {?Date} at
  */
 
 /** @type {Found} */
@@ -169,7 +169,7 @@ function Documents({ wantsKey }) {
 		}
 	}
 	return html`
-		<div class="row"><button type="button" onClick=${download}>Download the API as OpenAPI</button></div>
+		<div class="row"><button onClick=${download}>Download the API as OpenAPI</button></div>
 		<${ProblemBox} problem=${failed} />
 		<p class="hint">
 			The API, to try out, is at <code>docs</code>. It asks for the key as well, which a browser does not send along with a

@@ -58,7 +58,7 @@ export function Tape({ reader, mark, hasPoints, known, onKnown }) {
 						value=${text}
 						fault=${fault}
 						hint=${hasPoints ? "" : "Along the lens' axis."}
-						onInput=${(/** @type {string} */ typed) => {
+						onInput=${(typed) => {
 							setText(typed);
 							setFault("");
 						}}
@@ -72,12 +72,9 @@ export function Tape({ reader, mark, hasPoints, known, onKnown }) {
 				(one) => html`<li class="row ends" key=${`${one.u},${one.v}`}>
 					<span>${inMetres(one.depthM)} m along the axis at ${one.u}, ${one.v}</span>
 					<button
-						type="button"
 						aria-label=${`Forget ${inMetres(one.depthM)} m at ${one.u}, ${one.v}`}
 						onClick=${() => onKnown(known.filter((other) => other !== one))}
-					>
-						Forget
-					</button>
+					>Forget</button>
 				</li>`,
 			)}
 		</ul>`}

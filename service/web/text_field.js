@@ -22,8 +22,8 @@ export function TextField({ id, label, value, onInput, fault = "", hint, onChang
 				disabled=${disabled}
 				aria-invalid=${invalid}
 				aria-describedby=${`${id}-told`}
-				onInput=${(/** @type {any} */ event) => onInput(event.target.value)}
-				onChange=${(/** @type {any} */ event) => onChange?.(event.target.value)}
+				onInput=${(event) => onInput(event.target.value)}
+				onChange=${(event) => onChange?.(event.target.value)}
 			/>
 			<span id=${`${id}-told`} role=${fault ? role : null} class=${fault ? "fault" : "hint"}>${fault || hint}</span>
 		</div>
@@ -34,7 +34,7 @@ export function TextField({ id, label, value, onInput, fault = "", hint, onChang
 export function Choice({ label, value, options, onChange }) {
 	return html`<label class="field">
 		${label}
-		<select value=${value} onChange=${(/** @type {any} */ event) => onChange(event.target.value)}>
+		<select value=${value} onChange=${(event) => onChange(event.target.value)}>
 			${options.map(([one, words]) => html`<option key=${one} value=${one}>${words}</option>`)}
 		</select>
 	</label>`;

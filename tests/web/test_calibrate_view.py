@@ -136,6 +136,13 @@ def test_the_same_photograph_again_is_no_other(page: Page, photographs: list[Pat
     expect(page.get_by_text("1 photograph was there already.")).to_have_count(2)  # seen, and said aloud
     drop(page, photographs[0], role="focused")
     expect(shown).to_have_count(3)
+    # they would be lost where the page is left by mistake
+    leaving: list[str] = []
+    page.on("dialog", lambda dialog: (leaving.append(dialog.type), dialog.dismiss()))
+    page.get_by_role("heading", name="Calibrate").click()
+    page.evaluate("setTimeout(() => location.reload())")
+    eventually(page, lambda: leaving == ["beforeunload"])
+    expect(shown).to_have_count(3)
 
 
 @pytest.mark.parametrize(

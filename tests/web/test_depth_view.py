@@ -290,6 +290,41 @@ def test_what_is_close_is_told_to_hundredths_of_a_millimetre(page: Page, served:
     stage(page)
 
 
+def test_of_a_large_photograph_a_smaller_map_comes_and_places_stay_the_photographs(
+    opened: Page, served: Server, twelve_megapixels: bytes
+) -> None:
+    """By a camera with a strong blur: it is read on a small copy, which takes no time."""
+    lens = {"fx_px": 5000, "fy_px": 5100, "cx_px": 2000, "cy_px": 1500}
+    size = {"image_width_px": 4256, "image_height_px": 2850}
+    served.add({"name": "large", "focus_distance_m": 2.0, "k_cam_px": 50.0, **size, "intrinsics": lens})
+    opened.reload()
+    choose(opened, "large")
+    with opened.expect_response(lambda answer: "/depth?" in answer.url) as received:
+        give(opened, twelve_megapixels)
+    picture = stage(opened)
+    assert int(received.value.headers["content-length"]) < 37e6  # of 255
+    box = picture.bounding_box()
+    assert box is not None
+
+    def is_read(x: float, y: float) -> bool:
+        u, v = shown_pixel(opened)
+        return (u / 4256, v / 2850) == pytest.approx((x, y), abs=2 / box["width"])
+
+    read: list[tuple[int, int]] = []
+    for x, y in ((0.31, 0.62), (0.74, 0.23)):
+        picture.click(position={"x": x * box["width"], "y": y * box["height"]})
+        eventually(opened, partial(is_read, x, y))
+        read.append(shown_pixel(opened))
+    at = "".join(f"&at={u},{v}" for u, v in read)
+    told = served.ask("POST", f"/depth?camera=large&format=json{at}", twelve_megapixels).json()["points"]
+    assert number_in(opened, "depth") == pytest.approx(told[1]["depth_m"], rel=0.005)
+    rays = [np.array([(u - 2000) / 5000, (v - 1500) / 5100, 1]) for u, v in read]
+    ends = [ray * point["depth_m"] for ray, point in zip(rays, told, strict=True)]
+    assert number_in(opened, "straight") == pytest.approx(np.linalg.norm(ends[1]), rel=0.005)
+    assert number_in(opened, "distance") == pytest.approx(np.linalg.norm(ends[0] - ends[1]), rel=0.01)
+    served.ask("DELETE", "/cameras/large")
+
+
 def test_the_distance_leaves_the_lens_distortion_out(page: Page, served: Server, d200: dict[str, Any]) -> None:
     matrix = np.array([[950.0, 0, 322], [0, 950, 215.5], [0, 0, 1]])
     distortion = [-0.25, 0.1, 2e-3, -1e-3, 0.02]
@@ -351,11 +386,14 @@ def test_keys_alone_read_and_measure(measured: Page, maps: Callable[..., Any]) -
     expect(measured.locator("[data-value=distance]")).to_be_visible()
     picture.press("Enter")
     expect(said).to_have_text(f"Marked {u}, {v}.")
-    # read from another side, the cross begins where it was
+    # read from another side, the cross stays where it was
+    near = maps("&side=near")["depth_m"]
     measured.get_by_role("combobox", name="Side of the plane in focus").select_option("near")
-    expect(measured.locator("[data-value=pixel]")).to_have_count(0)
-    picture.press("ArrowRight")
+    expect(measured.locator("[data-value=depth]")).to_have_text(f"{near[v, u]:.3f} m")
+    assert abs(near - known["depth_m"])[v, u] > 0.01
     assert shown_pixel(measured) == (u, v)
+    picture.press("ArrowRight")
+    expect(measured.locator("[data-value=pixel]")).to_have_text(f"{u + 1}, {v}")
     picture.press("Escape")
     expect(said).to_have_text("Cleared.")
 
@@ -478,7 +516,7 @@ def test_another_side_or_focus_is_read_again_and_so_is_what_was_measured(
         assert number_in(measured, "depth") == pytest.approx(maps(query)["depth_m"][216, 322], abs=0.0006)
         expect(measured.locator("[data-label=distance]")).to_have_text(re.compile(r"^\d\.\d{3} m ± \d\.\d{3} m$"))
     # of another photograph neither is known
-    with measured.expect_request(re.compile(r"/depth\?camera=d200&format=npz$")):
+    with measured.expect_request(re.compile(r"/depth\?camera=d200&format=npz&longest_px=1600$")):
         give(measured)
     stage(measured)
     expect(side).to_have_value("auto")
@@ -532,7 +570,7 @@ def test_what_is_marked_stays_read_and_is_printed_with_its_scale(measured: Page)
 def test_the_side_may_be_told_before_the_photograph(opened: Page) -> None:
     choose(opened)
     opened.get_by_role("combobox", name="Side of the plane in focus").select_option("far")
-    with opened.expect_request(re.compile(r"/depth\?camera=d200&side=far&format=npz$")):
+    with opened.expect_request(re.compile(r"/depth\?camera=d200&side=far&format=npz&longest_px=1600$")):
         give(opened)
     stage(opened)
 
@@ -588,7 +626,7 @@ def test_a_tape_may_be_held_straight_from_the_lens(measured: Page, maps: Callabl
 
 
 def test_after_a_failed_reading_one_may_forget_a_depth_or_read_again(
-    measured: Page, expected_errors: list[str]
+    measured: Page, expected_errors: list[str], maps: Callable[..., Any]
 ) -> None:
     expected_errors.append(REFUSED)
     picture = stage(measured)
@@ -600,6 +638,13 @@ def test_after_a_failed_reading_one_may_forget_a_depth_or_read_again(
     alert, again = measured.get_by_role("alert"), measured.get_by_role("button", name="Read the depth")
     expect(alert).to_contain_text("The service does not answer.")
     expect(again).to_have_count(0)
+    # the answer before it is still there, and said to be
+    kept = "Still shown is the answer before: camera d200, side auto, focused at 2 m."
+    expect(measured.get_by_text(kept)).to_be_visible()
+    picture.hover(position=place_of(picture, 50, 50))
+    picture.hover(position=place_of(picture, 400, 300))
+    expect(measured.locator("[data-value=pixel]")).to_have_text("400, 300")
+    assert number_in(measured, "depth") == pytest.approx(maps()["depth_m"][300, 400], abs=0.0006)
     alert.get_by_role("button", name="Dismiss").press("Enter")
     expect(again).to_be_visible()
     expect(measured.get_by_role("button", name="Another photograph")).to_be_focused()
@@ -607,9 +652,11 @@ def test_after_a_failed_reading_one_may_forget_a_depth_or_read_again(
     with measured.expect_request(lambda request: "known=322%2C216%2C1.5" in request.url):
         again.click()
     measured.get_by_role("button", name="Cancel").click()
+    expect(measured.get_by_text(kept)).to_be_visible()
     measured.get_by_role("button", name="Forget 1.500 m at 322, 216").click()
     stage(measured)
     expect(again).to_have_count(0)
+    expect(measured.get_by_text(kept)).to_have_count(0)
 
 
 def test_a_camera_that_was_changed_elsewhere_is_told_by_its_new_numbers(
@@ -672,8 +719,13 @@ def test_what_is_no_photograph_is_not_said_to_be_readable(opened: Page, expected
     expected_errors.append(REFUSED)
     choose(opened)
     give(opened, b"no picture")
-    expect(opened.get_by_role("alert")).to_be_visible()
+    expect(opened.get_by_role("alert")).to_contain_text("Unsupported kind. This is not a JPEG")
     expect(opened.get_by_text("the service cannot read it either")).to_be_visible()
+    # of the next photograph nothing is said yet, where no camera reads it
+    opened.goto("#depth/nobody")
+    give(opened)
+    expect(opened.get_by_role("form", name="A camera from this photograph")).to_be_visible()
+    expect(opened.get_by_role("alert")).to_have_count(0)
 
 
 def test_points_in_space_are_drawn_turned_and_counted(measured: Page, maps: Callable[..., Any]) -> None:
@@ -905,6 +957,29 @@ def test_the_focus_of_one_shot_is_no_other_s(opened: Page, served: Server, d200:
         expect(focus).to_have_value("")
     asked.value.response()  # what is under way still needs the camera
     served.ask("DELETE", "/cameras/other")
+
+
+def test_one_of_many_cameras_is_found_by_a_part_of_its_name(
+    opened: Page, served: Server, d200: dict[str, Any], barriers: Callable[[Page], list[str]]
+) -> None:
+    names = [f"Robot-{number:02}" for number in range(11)]
+    for name in names:
+        served.add({**d200, "name": name})
+    opened.reload()
+    find, cameras = opened.get_by_label("Find a camera"), opened.get_by_role("combobox", name="Camera", exact=True)
+    choose(opened)
+    find.fill("ot-0")
+    expect(cameras.get_by_role("option", disabled=False)).to_have_text(["d200", *names[:10]])
+    assert barriers(opened) == []
+    find.fill("robot-07")
+    find.press("Enter")
+    expect(cameras).to_have_value("Robot-07")
+    assert opened.url.endswith("#depth/Robot-07")
+    find.fill("nobody")
+    find.press("Enter")
+    expect(cameras).to_have_value("Robot-07")
+    for name in names:
+        served.ask("DELETE", f"/cameras/{name}")
 
 
 def test_the_camera_stays_in_the_address(opened: Page) -> None:

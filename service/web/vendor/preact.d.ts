@@ -3,4 +3,5 @@ import type { VNode } from "preact";
 
 export { Component, createContext, h, render } from "preact";
 export * from "preact/hooks";
-export function html(strings: TemplateStringsArray, ...values: unknown[]): VNode;
+type Value = object | string | number | boolean | null | undefined | ((...about: any[]) => unknown);
+export function html(strings: TemplateStringsArray, ...values: Value[]): VNode;
