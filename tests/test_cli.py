@@ -346,7 +346,8 @@ def test_a_folder_of_photographs_becomes_depth(bench: Path, tiny_model_dir: Path
         cv2.imwrite(str(photos / f"{name}.png"), np.full((48, 64, 3), brightness_for(blur_px), np.uint8))
     (photos / "broken.jpg").write_bytes(b"\xff\xd8\xff")
     asked = ["depth", str(photos), "--camera", "bench", "--out", str(out), "--model", str(tiny_model_dir)]
-    asked += ["--side", "near", "--format", "npy", "--format", "json", "--at", "3,4"]
+    asked += ["--side", "near", "--format", "npy", "--format", "json", "--at", "40,4"]
+    asked += ["--longest-px", "32"]
 
     done = camind(bench, *asked, COLUMNS="200")
     assert done.returncode == 1, done.stderr
@@ -354,7 +355,7 @@ def test_a_folder_of_photographs_becomes_depth(bench: Path, tiny_model_dir: Path
     assert "no depth: The jpeg file" in done.stdout
     assert sorted(file.name for file in out.iterdir()) == ["half [b].json", "half [b].npy", "whole.json", "whole.npy"]
     for name, depth_m in (("half [b]", 2 / 1.5), ("whole", 1.0)):
-        assert np.load(out / f"{name}.npy") == pytest.approx(np.full((48, 64), depth_m), rel=0.02)
+        assert np.load(out / f"{name}.npy") == pytest.approx(np.full((24, 32), depth_m), rel=0.02)
         assert json.loads((out / f"{name}.json").read_text())["points"][0]["depth_m"] == pytest.approx(
             depth_m, rel=0.02
         )
@@ -390,6 +391,7 @@ def test_a_table_tells_photographs_of_any_name_apart(bench: Path, tiny_model_dir
         (("photos", "--camera", "bench", "--format", "gif"), 2, "format: "),
         (("photos", "--camera", "bench", "--known", "1,2"), 2, "known.0: "),
         (("photos", "--camera", "bench", "--maps", "depth"), 2, "maps.0: "),
+        (("photos", "--camera", "bench", "--longest-px", "8"), 2, "longest_px: "),
         (("photos", "--camera", "bench", "--out", "photos"), 2, "photos holds photographs"),
         (("photos", "others/a.jpg", "--camera", "bench"), 2, "would become one file"),
         (("empty", "--camera", "bench"), 2, "no photographs in empty"),
