@@ -10,7 +10,7 @@ from uuid import uuid4
 import cv2
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, Route, expect
+from playwright.sync_api import Browser, Dialog, Page, Route, expect
 
 from model_export.started_server import Server, serving
 from tests.inference.photographs import tiff
@@ -138,7 +138,12 @@ def test_the_same_photograph_again_is_no_other(page: Page, photographs: list[Pat
     expect(shown).to_have_count(3)
     # they would be lost where the page is left by mistake
     leaving: list[str] = []
-    page.on("dialog", lambda dialog: (leaving.append(dialog.type), dialog.dismiss()))
+
+    def stay(dialog: Dialog) -> None:
+        leaving.append(dialog.type)
+        dialog.dismiss()
+
+    page.once("dialog", stay)
     page.get_by_role("heading", name="Calibrate").click()
     page.evaluate("setTimeout(() => location.reload())")
     eventually(page, lambda: leaving == ["beforeunload"])
