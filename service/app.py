@@ -1,7 +1,6 @@
 """The app: routes and middleware at once; database, model and worker only when it starts."""
 
 import asyncio
-from collections import Counter
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from functools import partial
@@ -87,7 +86,6 @@ def create_app(settings: Settings, calibrate: Calibrate = calibrate) -> FastAPI:
     app.state.calibrate = calibrate
     app.state.is_stopping = False
     app.state.arrivals = Arrivals((settings.worker_slots + settings.queue_size) * settings.max_image_bytes)
-    app.state.photographs = Counter()
     app.state.followers = Followers()
     _add_middleware(app, settings)
     handlers.install(app)

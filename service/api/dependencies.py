@@ -12,12 +12,12 @@ from pydantic import Field
 
 from service.api.clients import Followers
 from service.api.problems import invalid_request
-from service.api.shares import Share
 from service.api.texts import Worded
 from service.config import Settings
 from service.errors import BadRequest, UnsupportedKind
 from service.inference.artifact import ModelFolder
 from service.inference.estimator import Estimator
+from service.inference.worker import Worker
 from service.principal import Principal
 from service.runner import Runner
 from service.storage.calibrations import Calibrations
@@ -51,9 +51,16 @@ async def get_estimator(request: Request) -> Estimator:
     return estimator
 
 
-async def get_worker(request: Request) -> Share:
+async def get_sharer(request: Request) -> str | None:
     principal: Principal = request.state.principal
-    return Share(request.app.state.worker, request.app.state.photographs, principal.sharer)
+    return principal.sharer
+
+
+async def get_worker(request: Request, sharer: Annotated[str | None, Depends(get_sharer)]) -> Worker:
+    """The worker, while it has room: a full queue is told before a photograph is received. Raises ``Busy``."""
+    worker: Worker = request.app.state.worker
+    worker.require_room(sharer)
+    return worker
 
 
 async def get_calibrations(request: Request, owner: Annotated[str, Depends(get_owner)]) -> Calibrations:
@@ -127,7 +134,8 @@ SettingsDep = Annotated[Settings, Depends(get_settings)]
 CamerasDep = Annotated[Cameras, Depends(get_cameras)]
 ModelDep = Annotated[ModelFolder, Depends(get_model)]
 EstimatorDep = Annotated[Estimator, Depends(get_estimator)]
-WorkerDep = Annotated[Share, Depends(get_worker)]
+SharerDep = Annotated[str | None, Depends(get_sharer)]
+WorkerDep = Annotated[Worker, Depends(get_worker)]
 CalibrationsDep = Annotated[Calibrations, Depends(get_calibrations)]
 SpoolDep = Annotated[Spool, Depends(get_spool)]
 RunnerDep = Annotated[Runner, Depends(get_runner)]

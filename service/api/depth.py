@@ -8,7 +8,7 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
 from service.api.clients import unless_gone
-from service.api.dependencies import CamerasDep, EstimatorDep, SettingsDep, WorkerDep
+from service.api.dependencies import CamerasDep, EstimatorDep, SettingsDep, SharerDep, WorkerDep
 from service.api.depth_schemas import DepthQuery, DepthRead
 from service.api.negotiation import choose_format
 from service.api.orders import FORMAT_TYPES, Order, fulfil
@@ -79,6 +79,7 @@ async def estimate_depth(
     cameras: CamerasDep,
     estimator: EstimatorDep,
     worker: WorkerDep,
+    sharer: SharerDep,
 ) -> Response:
     """Depth along the optical axis for every pixel, from the blur of one photograph and its camera.
 
@@ -89,7 +90,7 @@ async def estimate_depth(
     upload = await receive_photograph(request)
     record = await run_in_threadpool(cameras.get, query.camera)
     order = Order.of(upload, record, query, (chosen,), ImageLimits.of(settings))
-    outcome = await unless_gone(request, worker.run(fulfil, order, estimator))
+    outcome = await unless_gone(request, worker.run(sharer, fulfil, order, estimator))
     answer = outcome.value
     (encoded,) = answer.encoded
     timings_ms = {**answer.timings_ms, "wait": outcome.wait_ms}

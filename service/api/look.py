@@ -8,7 +8,7 @@ from fastapi.concurrency import run_in_threadpool
 
 from service.api.calibration_schemas import FocalLengthFrom, LookRead
 from service.api.clients import unless_gone
-from service.api.dependencies import CamerasDep, SettingsDep, WorkerDep
+from service.api.dependencies import CamerasDep, SettingsDep, SharerDep, WorkerDep
 from service.api.problems import responses
 from service.api.schemas import Name
 from service.api.target import GridDep
@@ -50,6 +50,7 @@ async def look_at_photograph(
     settings: SettingsDep,
     cameras: CamerasDep,
     worker: WorkerDep,
+    sharer: SharerDep,
     camera: Annotated[Name | None, Query(description="Its focal length gives distance and tilt")] = None,
 ) -> LookRead:
     """Where the circles are, how blurred, how far away and how exposed. Nothing is stored.
@@ -59,7 +60,7 @@ async def look_at_photograph(
     upload = await receive_photograph(request)
     known = (await run_in_threadpool(cameras.get, camera)).draft.with_focal_length if camera else None
     order = Order(upload.data, grid, known, ImageLimits.of(settings))
-    return (await unless_gone(request, worker.run(fulfil, order))).value
+    return (await unless_gone(request, worker.run(sharer, fulfil, order))).value
 
 
 def fulfil(cancellation: Cancellation, order: Order) -> LookRead:

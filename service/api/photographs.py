@@ -6,7 +6,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 
 from service.api.clients import unless_gone
-from service.api.dependencies import SettingsDep, WorkerDep
+from service.api.dependencies import SettingsDep, SharerDep, WorkerDep
 from service.api.problems import responses
 from service.api.uploads import REQUEST_BODY, Upload, receive_photograph
 from service.errors import BadRequest, Busy, InvalidImage, TooLarge, UnsupportedKind
@@ -44,12 +44,13 @@ async def preview_photograph(
     request: Request,
     settings: SettingsDep,
     worker: WorkerDep,
+    sharer: SharerDep,
     longest_px: Annotated[int, Query(ge=16, le=4096, description="Its longer side at most")] = 1600,
 ) -> Response:
     """What HEIC and raw files show, for browsers that do not read them. Nothing is stored."""
     upload = await receive_photograph(request)
     order = Order(upload, longest_px, ImageLimits.of(settings))
-    encoded = (await unless_gone(request, worker.run(fulfil, order))).value
+    encoded = (await unless_gone(request, worker.run(sharer, fulfil, order))).value
     return Response(encoded.body, media_type=encoded.media_type)
 
 

@@ -1,6 +1,7 @@
 """A bounded pool of threads for the heavy work: slots, a queue, a deadline and cancellation.
 
-A slot is held until its thread really ends, so that work nobody waits for any more still counts.
+A slot is held until its thread really ends, so that work nobody waits for any more still counts. Who shares the queue
+with others has a line of its own, which takes no more of it than it leaves free, so that another always finds room.
 """
 
 import asyncio
@@ -50,7 +51,7 @@ class Worker:
         self._tell_wait = tell_wait or (lambda _: None)
         self._pool = ThreadPoolExecutor(max_workers=slots, thread_name_prefix="inference")
         self._lock = threading.Lock()
-        self._live: set[Cancellation] = set()
+        self._live: dict[Cancellation, str | None] = {}  # each in its line
         self._lines: dict[str | None, deque[Callable[[], None]]] = {}
         self._typical_s = FIRST_GUESS_S
 
@@ -69,20 +70,20 @@ class Worker:
         """Waiting for a slot."""
         return max(0, self.in_flight - self.slots)
 
+    def require_room(self, line: str | None) -> None:
+        """Raise ``Busy`` where ``run`` would, so that nobody sends a photograph for nothing; no place is kept."""
+        with self._lock:
+            self._require_room(line)
+
     async def run(
-        self, work: Callable[Concatenate[Cancellation, P], T], *args: P.args, **kwargs: P.kwargs
+        self, line: str | None, work: Callable[Concatenate[Cancellation, P], T], *args: P.args, **kwargs: P.kwargs
     ) -> Outcome[T]:
         """Run the work in a slot; cancelling the awaiting task asks the work to stop.
 
-        Raises ``Busy`` when the queue is full or the deadline passes, and whatever the work raises.
+        ``line`` is whose it is, None where there is no other. Raises ``Busy`` when the queue is full, the line has its
+        share of it or the deadline passes, and whatever the work raises.
         """
-        return await self.run_in_line(None, work, *args, **kwargs)
-
-    async def run_in_line(
-        self, line: str | None, work: Callable[Concatenate[Cancellation, P], T], *args: P.args, **kwargs: P.kwargs
-    ) -> Outcome[T]:
-        """As ``run``, in one of several lines."""
-        cancellation = self._admit()
+        cancellation = self._admit(line)
         future = self._submit(line, cancellation, lambda: work(cancellation, *args, **kwargs))
         try:
             async with asyncio.timeout(self.deadline_s) as deadline:
@@ -105,16 +106,24 @@ class Worker:
             cancellation.cancel()
         self._pool.shutdown(wait=True)
 
-    def _admit(self) -> Cancellation:
+    def _admit(self, line: str | None) -> Cancellation:
         cancellation = Cancellation()
         with self._lock:
-            if len(self._live) >= self.slots + self.queue_size:
-                raise Busy(
-                    f"{len(self._live)} requests run or wait, with room for no more: try again later.",
-                    retry_after_s=self._retry_after_s(),
-                )
-            self._live.add(cancellation)
+            self._require_room(line)
+            self._live[cancellation] = line
         return cancellation
+
+    def _require_room(self, line: str | None) -> None:
+        """Raise ``Busy``; the lock is held."""
+        taken = tuple(self._live.values())
+        own, room = taken.count(line), self.slots + self.queue_size - len(taken)
+        if room <= 0:
+            reason = f"{len(taken)} requests run or wait, with room for no more"
+        elif line is not None and len(taken) >= self.slots and own >= room:
+            reason = f"{own} photographs of this owner run or wait, and the room left is for others"
+        else:
+            return
+        raise Busy(f"{reason}: try again later.", retry_after_s=self._retry_after_s())
 
     def _submit(self, line: str | None, cancellation: Cancellation, work: Callable[[], T]) -> Future[Outcome[T]]:
         submitted = time.perf_counter()
@@ -136,13 +145,13 @@ class Worker:
             except BaseException as exc:
                 future.set_exception(exc)
 
-        future.add_done_callback(lambda _: self._live.discard(cancellation))
+        future.add_done_callback(lambda _: self._live.pop(cancellation, None))
         with self._lock:
             self._lines.setdefault(line, deque()).append(settle)
         try:
             self._pool.submit(self._work_next)
         except RuntimeError as exc:
-            self._live.discard(cancellation)
+            self._live.pop(cancellation, None)
             raise Busy("The service is stopping.") from exc
         return future
 

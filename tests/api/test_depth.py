@@ -521,7 +521,7 @@ def test_a_deadline_that_passes_is_503_with_retry_after(app: FastAPI, bench: Tes
 def test_a_full_queue_is_503_with_retry_after(app: FastAPI, bench: TestClient) -> None:
     worker, release = replace_worker(app, deadline_s=10), threading.Event()
     assert bench.portal is not None
-    held = bench.portal.start_task_soon(worker.run, lambda _: release.wait(10))
+    held = bench.portal.start_task_soon(worker.run, None, lambda _: release.wait(10))
     while not worker.in_flight:
         pass
     response = ask(bench)
@@ -566,7 +566,7 @@ def test_a_client_that_goes_away_gives_up_its_place(app: FastAPI) -> None:
         sent.append(message)
 
     async def scenario(worker: Worker) -> None:
-        holding = asyncio.create_task(worker.run(hold))
+        holding = asyncio.create_task(worker.run(None, hold))
         await asyncio.sleep(0.02)
         scope: dict[str, Any] = {"type": "http", "method": "POST", "path": "/depth", "headers": []}
         scope |= {"raw_path": b"/depth", "root_path": "", "query_string": b"camera=bench"}

@@ -70,7 +70,7 @@ def test_slots_and_queue_are_as_they_are_now(client: TestClient, app: FastAPI, r
         released.wait(10)
 
     async def run() -> None:
-        await worker.run(hold)
+        await worker.run(None, hold)
 
     assert figure(client, "camind_depth_slots") == worker.slots == 1
     assert figure(client, "camind_depth_queue_size") == worker.queue_size == 16

@@ -12,7 +12,6 @@ from fastapi import FastAPI
 from httpx2 import Response
 from starlette.testclient import TestClient
 
-from service.api.shares import Share
 from service.api.uploads import Arrivals
 from service.app import create_app
 from service.config import Settings
@@ -41,20 +40,17 @@ def taken(slots: int, queue_size: int, wanted: dict[str | None, int], release: t
     """How many places each owner gets, who ask one after another, and afterwards all are free again."""
 
     async def scenario() -> Counter[str | None]:
-        counts: Counter[str | None] = Counter()
         worker = Worker(slots=slots, queue_size=queue_size, deadline_s=5)
-        begun: list[asyncio.Task[Outcome[None]]] = []
+        begun: dict[asyncio.Task[Outcome[None]], str | None] = {}
         for owner, count in wanted.items():
-            share = Share(worker, counts, owner)
-            begun += [asyncio.create_task(share.run(hold, release)) for _ in range(count)]
+            begun |= {asyncio.create_task(worker.run(owner, hold, release)): owner for _ in range(count)}
             await asyncio.sleep(0.02)
-        found = counts.copy()
         release.set()
         ends = await asyncio.gather(*begun, return_exceptions=True)
         worker.close()
-        assert sum(isinstance(end, Busy) for end in ends) == sum(wanted.values()) - found.total()
-        assert counts.total() == 0
-        return found
+        assert worker.in_flight == 0
+        assert all(isinstance(end, Outcome | Busy) for end in ends)
+        return Counter(owner for owner, end in zip(begun.values(), ends, strict=True) if isinstance(end, Outcome))
 
     return asyncio.run(scenario())
 
@@ -102,14 +98,20 @@ def test_an_owner_who_sends_many_photographs_is_refused_before_another(
     assert isinstance(shared.app, FastAPI)
     assert shared.portal is not None
     state = shared.app.state
-    shared.portal.start_task_soon(Share(state.worker, state.photographs, "alice").run, hold, release)
+    shared.portal.start_task_soon(state.worker.run, "alice", hold, release)
     with ThreadPoolExecutor() as pool:
-        path, picture = "/photographs/preview", png(corners())
-        refused = shared.post(path, content=picture, headers=keys[0])
-        answer = pool.submit(shared.post, path, content=picture, headers=keys[1])
-        assert (refused.status_code, refused.headers["retry-after"]) == (503, "1")
+        picture = png(corners())
+        for path in ("/photographs/preview", "/depth?camera=x", "/calibrate/look"):
+            refused = shared.post(path, content=never_read(), headers=keys[0])
+            assert (refused.status_code, refused.headers["retry-after"]) == (503, "1")
+        answer = pool.submit(shared.post, "/photographs/preview", content=picture, headers=keys[1])
         release.set()
         assert answer.result().status_code == 200
+
+
+def never_read() -> Iterator[bytes]:
+    pytest.fail("a photograph that is refused was received")
+    yield b""
 
 
 def test_an_owner_who_sends_many_calibrations_waits_for_another_s(

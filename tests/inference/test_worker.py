@@ -44,7 +44,7 @@ async def until_idle(worker: Worker) -> None:
 
 def test_work_returns_its_value_and_its_wait() -> None:
     worker = Worker(slots=1, queue_size=0, deadline_s=5)
-    outcome = asyncio.run(worker.run(add, 2, 3))
+    outcome = asyncio.run(worker.run(None, add, 2, 3))
     assert outcome.value == 5
     assert 0 <= outcome.wait_ms < 1000
     worker.close()
@@ -53,16 +53,16 @@ def test_work_returns_its_value_and_its_wait() -> None:
 def test_a_full_queue_is_refused_with_a_time_to_come_back(release: threading.Event) -> None:
     async def scenario() -> None:
         worker = Worker(slots=1, queue_size=1, deadline_s=5)
-        running = [asyncio.create_task(worker.run(hold, release)) for _ in range(2)]
+        running = [asyncio.create_task(worker.run(None, hold, release)) for _ in range(2)]
         await asyncio.sleep(0.02)
         with pytest.raises(Busy) as refused:
-            await worker.run(add, 1, 1)
+            await worker.run(None, add, 1, 1)
         assert refused.value.retry_after_s >= 1
         release.set()
         outcomes = await asyncio.gather(*running)
         assert [outcome.value for outcome in outcomes] == ["held", "held"]
         assert outcomes[1].wait_ms > outcomes[0].wait_ms
-        assert (await worker.run(add, 1, 1)).value == 2
+        assert (await worker.run(None, add, 1, 1)).value == 2
         worker.close()
 
     asyncio.run(scenario())
@@ -75,13 +75,13 @@ def test_the_deadline_answers_at_once_and_the_slot_is_held_until_the_thread_ends
         worker = Worker(slots=1, queue_size=0, deadline_s=0.05)
         started = time.perf_counter()
         with pytest.raises(Busy, match=r"0\.05 s"):
-            await worker.run(hold, release)
+            await worker.run(None, hold, release)
         assert time.perf_counter() - started < 2
         with pytest.raises(Busy):
-            await worker.run(add, 1, 1)
+            await worker.run(None, add, 1, 1)
         release.set()
         await until_idle(worker)
-        assert (await worker.run(add, 1, 1)).value == 2
+        assert (await worker.run(None, add, 1, 1)).value == 2
         worker.close()
 
     asyncio.run(scenario())
@@ -91,7 +91,7 @@ def test_the_deadline_stops_work_that_listens() -> None:
     async def scenario() -> None:
         worker = Worker(slots=1, queue_size=0, deadline_s=0.05)
         with pytest.raises(Busy):
-            await worker.run(obey)
+            await worker.run(None, obey)
         await until_idle(worker)
         worker.close()
 
@@ -101,7 +101,7 @@ def test_the_deadline_stops_work_that_listens() -> None:
 def test_cancelling_the_waiting_task_frees_the_slot() -> None:
     async def scenario() -> None:
         worker = Worker(slots=1, queue_size=0, deadline_s=5)
-        task = asyncio.create_task(worker.run(obey))
+        task = asyncio.create_task(worker.run(None, obey))
         await asyncio.sleep(0.02)
         task.cancel()
         with pytest.raises(asyncio.CancelledError):
@@ -116,9 +116,9 @@ def test_a_queued_request_that_is_cancelled_never_runs(release: threading.Event)
     async def scenario() -> None:
         ran: list[int] = []
         worker = Worker(slots=1, queue_size=1, deadline_s=5)
-        first = asyncio.create_task(worker.run(hold, release))
+        first = asyncio.create_task(worker.run(None, hold, release))
         await asyncio.sleep(0.02)
-        second = asyncio.create_task(worker.run(lambda _: ran.append(1)))
+        second = asyncio.create_task(worker.run(None, lambda _: ran.append(1)))
         await asyncio.sleep(0.02)
         second.cancel()
         await asyncio.wait([second])
@@ -135,10 +135,10 @@ def test_lines_take_turns(release: threading.Event) -> None:
     async def scenario() -> list[str]:
         ran: list[str] = []
         worker = Worker(slots=1, queue_size=9, deadline_s=5)
-        begun = [asyncio.create_task(worker.run(hold, release))]
+        begun = [asyncio.create_task(worker.run(None, hold, release))]
         for name in ("a1", "a2", "a3", "b1", "b2", "c1"):
             await asyncio.sleep(0)
-            begun.append(asyncio.create_task(worker.run_in_line(name[0], lambda _, name=name: ran.append(name))))
+            begun.append(asyncio.create_task(worker.run(name[0], lambda _, name=name: ran.append(name))))
         await asyncio.sleep(0.02)
         release.set()
         await asyncio.gather(*begun)
@@ -151,7 +151,7 @@ def test_lines_take_turns(release: threading.Event) -> None:
 def test_closing_ends_those_that_wait() -> None:
     async def scenario() -> None:
         worker = Worker(slots=1, queue_size=1, deadline_s=5)
-        tasks = [asyncio.create_task(worker.run(obey)) for _ in range(2)]
+        tasks = [asyncio.create_task(worker.run(None, obey)) for _ in range(2)]
         await asyncio.sleep(0.02)
         await asyncio.to_thread(worker.close)
         for end in await asyncio.gather(*tasks, return_exceptions=True):
@@ -166,20 +166,20 @@ def test_errors_of_the_work_come_through() -> None:
 
     worker = Worker(slots=1, queue_size=0, deadline_s=5)
     with pytest.raises(TimeoutError, match="its own"):
-        asyncio.run(worker.run(fail))
+        asyncio.run(worker.run(None, fail))
     worker.close()
 
 
 def test_closing_stops_running_work() -> None:
     async def scenario() -> None:
         worker = Worker(slots=1, queue_size=0, deadline_s=5)
-        task = asyncio.create_task(worker.run(obey))
+        task = asyncio.create_task(worker.run(None, obey))
         await asyncio.sleep(0.02)
         await asyncio.to_thread(worker.close)
         with pytest.raises(Busy, match="stopping"):
             await task
         with pytest.raises(Busy, match="stopping"):
-            await worker.run(add, 1, 1)
+            await worker.run(None, add, 1, 1)
         assert worker.in_flight == 0
 
     asyncio.run(scenario())
