@@ -145,9 +145,18 @@ class Worker:
             except BaseException as exc:
                 future.set_exception(exc)
 
-        future.add_done_callback(lambda _: self._live.pop(cancellation, None))
+        def leave(_: Future[Outcome[T]]) -> None:
+            with self._lock:
+                self._live.pop(cancellation, None)
+                waiting = self._lines.get(line, deque())
+                if settle in waiting:  # what nobody waits for any more holds its photograph no longer
+                    waiting.remove(settle)
+                if not waiting:
+                    self._lines.pop(line, None)
+
         with self._lock:
             self._lines.setdefault(line, deque()).append(settle)
+        future.add_done_callback(leave)
         try:
             self._pool.submit(self._work_next)
         except RuntimeError as exc:
@@ -156,8 +165,10 @@ class Worker:
         return future
 
     def _work_next(self) -> None:
-        """The first of the next line, which then goes behind the others."""
+        """The first of the next line, which then goes behind the others; nothing where that one left."""
         with self._lock:
+            if not self._lines:
+                return
             line = next(iter(self._lines))
             waiting = self._lines.pop(line)
             settle = waiting.popleft()

@@ -1,8 +1,10 @@
 """Slots, queue, deadline: what is refused, what is waited for, what is freed."""
 
 import asyncio
+import gc
 import threading
 import time
+import weakref
 from collections.abc import Iterator
 
 import pytest
@@ -127,6 +129,33 @@ def test_a_queued_request_that_is_cancelled_never_runs(release: threading.Event)
         await first
         worker.close()
         assert ran == []
+
+    asyncio.run(scenario())
+
+
+def test_what_left_the_queue_is_held_no_longer(release: threading.Event) -> None:
+    class Photograph:
+        pass
+
+    async def leave(worker: Worker) -> "weakref.ref[Photograph]":
+        photograph = Photograph()
+        waiting = asyncio.create_task(worker.run("a", lambda _, photograph: photograph, photograph))
+        await asyncio.sleep(0.02)
+        waiting.cancel()
+        await asyncio.wait([waiting])
+        return weakref.ref(photograph)
+
+    async def scenario() -> None:
+        worker = Worker(slots=1, queue_size=1, deadline_s=5)
+        first = asyncio.create_task(worker.run("b", hold, release))
+        await asyncio.sleep(0.02)
+        left = [await leave(worker) for _ in range(3)]
+        gc.collect()
+        assert [photograph() for photograph in left] == [None] * 3
+        another = asyncio.create_task(worker.run("a", add, 1, 1))
+        release.set()
+        assert ((await first).value, (await another).value) == ("held", 2)
+        worker.close()
 
     asyncio.run(scenario())
 
