@@ -219,7 +219,7 @@ class LimitRequests:
         limits = self._limits_by_path.get(scope["path"], self._limits)
         headers = Headers(scope=scope)
         coding, stated = headers.get("content-encoding", "identity"), headers.get("content-length", "")
-        if scope["method"] in WITH_BODY and coding != "identity":
+        if scope["method"] in WITH_BODY and coding.lower() != "identity":
             raise UnsupportedKind(f"Send the body as it is, without Content-Encoding: {coding[:40]}.")
         if stated.isdecimal() and int(stated[:20]) > limits.max_bytes:
             raise _too_large(limits.max_bytes)

@@ -58,7 +58,7 @@ def test_a_compressed_body_is_refused_by_that_name(client: TestClient) -> None:
         refused = client.post(path, content=gzip.compress(body), headers={"Content-Encoding": "gzip"})
         assert (refused.status_code, refused.json()["type"]) == (415, "urn:camind:problem:unsupported-kind")
         assert "Content-Encoding: gzip" in refused.json()["detail"]
-    plain = client.post("/photographs/preview", content=png(corners()), headers={"Content-Encoding": "identity"})
+    plain = client.post("/photographs/preview", content=png(corners()), headers={"Content-Encoding": "Identity"})
     assert plain.status_code == 200
 
 
