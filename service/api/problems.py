@@ -76,7 +76,7 @@ class Problem(BaseModel):
 
 def problem(error: CamindError) -> Problem:
     """The error as problem details."""
-    errors = [ProblemField(pointer=item.pointer, detail=item.detail) for item in error.errors[:MAX_ERRORS]]
+    errors = [ProblemField(pointer=item.pointer, detail=item.detail) for item in error.errors]
     return Problem(
         type=TYPE_PREFIX + error.code,
         title=error.title,
@@ -193,7 +193,8 @@ def invalid_request(faults: Sequence[Mapping[str, Any]]) -> BadRequest:
     """Pydantic's faults as one error; what the client sent is never echoed, only where it went wrong."""
     # an unknown field often is the missing one, wrongly named: it explains most, so it comes first
     ordered = sorted(faults, key=lambda fault: bool(fault["type"] != "extra_forbidden"))
-    fields = tuple(FieldProblem(_pointer(fault), _detail(fault)) for fault in ordered)
+    # to word thousands of them would hold up everybody
+    fields = tuple(FieldProblem(_pointer(fault), _detail(fault)) for fault in ordered[:MAX_ERRORS])
     first = fields[0]
     where = first.pointer.removeprefix("#").strip("/").replace("/", ".") or "body"
     return BadRequest(f"{where}: {first.detail}", errors=fields)

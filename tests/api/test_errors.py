@@ -10,6 +10,7 @@ from fastapi import FastAPI
 from sqlalchemy import Engine
 from starlette.testclient import TestClient
 
+from service.api.problems import invalid_request
 from service.config import Settings
 
 JSON = {"Content-Type": "application/json"}
@@ -220,6 +221,8 @@ def test_a_lone_surrogate_breaks_nothing(client: TestClient) -> None:
 def test_many_faults_are_cut_short(client: TestClient) -> None:
     answer = client.post("/cameras", json={f"field{number}": 1 for number in range(500)})
     assert 1 < len(require_problem(answer, 422, "invalid-request")["errors"]) <= 50
+    faults = [{"type": "missing", "loc": ("body", str(number)), "msg": ""} for number in range(500)]
+    assert len(invalid_request(faults).errors) == 50  # no more of them are put into words
 
 
 def test_a_failure_inside_tells_the_log_and_not_the_client(app: FastAPI) -> None:
