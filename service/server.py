@@ -1,8 +1,10 @@
-"""uvicorn with what it lacks: a deadline for headers that never end, and problem+json for what is no HTTP."""
+"""uvicorn with what it lacks: a deadline for headers that never end, targets in every form, no bodies in crumbs, and
+problem+json for what is no HTTP."""
 
 import asyncio
 import errno
 import os
+import re
 import resource
 import signal
 import socket
@@ -30,6 +32,10 @@ KEEP_ALIVE_S = 75  # longer than what proxies keep: who closes last is never ask
 BACKLOG = 2048
 LET_IN = 16  # connections at a time, before one of them is looked at
 MOST_HEADER_BYTES = 65_536
+# a body may have this many pieces, and one more for so many of its bytes: each costs 10 microseconds, however small
+MOST_CRUMBS = 1_000
+CRUMB_BYTES = 64
+ABSOLUTE_FORM = re.compile(rb"https?://([^/?#]+)(.*)", re.IGNORECASE)
 SPARE_FILES = 256  # of those the process may open: for the database, photographs, decoders, and a burst of connections
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 UNANSWERED = (h11.IDLE, h11.SEND_RESPONSE)
@@ -60,6 +66,40 @@ class HeadersTooLarge(BadRequest):
     title = "Headers too large"
 
 
+class Crumbs(h11.RemoteProtocolError):
+    """A body in so many small pieces that taking them in would hold up everybody."""
+
+
+class Connection(h11.Connection):
+    """Takes targets in every form (RFC 9112, 3.2), and no body in crumbs."""
+
+    _crumbs = 0.0
+
+    def next_event(self) -> h11.Event | type[h11.NEED_DATA] | type[h11.PAUSED]:
+        event = super().next_event()
+        if isinstance(event, h11.Request):
+            self._crumbs = 0
+            return in_origin_form(event)
+        if isinstance(event, h11.Data):
+            self._crumbs = max(0, self._crumbs + 1 - len(event.data) / CRUMB_BYTES)
+            if self._crumbs > MOST_CRUMBS:
+                raise Crumbs(f"The body comes in pieces of less than {CRUMB_BYTES} bytes: send it in larger ones.")
+        return event
+
+
+def in_origin_form(request: h11.Request) -> h11.Request:
+    """The request with a path as its target: a host named there is the one, and what asks of all asks of the page."""
+    if found := ABSOLUTE_FORM.fullmatch(request.target):
+        host, rest = found.groups()
+        target = rest if rest.startswith(b"/") else b"/" + rest
+        headers = [(b"Host", host), *(pair for pair in request.headers if pair[0] != b"host")]
+    elif (request.method, request.target) == (b"OPTIONS", b"*"):
+        target, headers = b"/", list(request.headers)
+    else:
+        return request
+    return h11.Request(method=request.method, target=target, headers=headers, http_version=request.http_version)
+
+
 class DeadlineProtocol(H11Protocol):
     """HTTP/1.1 whose requests must have come whole by a deadline; a connection may not dawdle for ever.
 
@@ -74,6 +114,7 @@ class DeadlineProtocol(H11Protocol):
     _write_clock: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self.conn = Connection(h11.SERVER, MOST_HEADER_BYTES)
         super().connection_made(cast(asyncio.Transport, transport))
         if len(self.connections) > most_connections():
             self.transport.abort()
@@ -108,7 +149,7 @@ class DeadlineProtocol(H11Protocol):
         if isinstance(cause, h11.RemoteProtocolError) and cause.error_status_hint == HeadersTooLarge.status:
             self._refuse(HeadersTooLarge(f"The request line and headers may have at most {MOST_HEADER_BYTES} bytes."))
         else:
-            self._refuse(MalformedRequest(msg))
+            self._refuse(MalformedRequest(str(cause) if isinstance(cause, Crumbs) else msg))
 
     def _is_receiving(self) -> bool:
         has_part_of_headers = self.conn.their_state is h11.IDLE and bool(self.conn.trailing_data[0])
@@ -250,7 +291,6 @@ def serve(app: FastAPI, settings: Settings, listener: socket.socket) -> bool:
         EndConnections(app, settings.receive_deadline_s),
         http=protocol,
         backlog=LET_IN,
-        h11_max_incomplete_event_size=MOST_HEADER_BYTES,
         ws="none",
         log_config=None,
         access_log=False,

@@ -10,9 +10,11 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import h11
 import pytest
 
 from model_export.started_server import Server, serving
+from service.server import MOST_CRUMBS, Connection
 
 RECEIVE_DEADLINE_S = 1.0
 
@@ -102,6 +104,48 @@ def test_a_body_that_is_no_http_gets_a_problem(server: Server, method: str, paus
     events = server.poll(lambda: events_of(server, request_id))
     assert events[0]["event"] == "refused"
     assert "Traceback" not in server.log
+
+
+@pytest.mark.parametrize(("size", "expected"), [(1, 400), (32, 400), (64, 415)])
+def test_a_body_in_crumbs_is_refused(server: Server, size: int, expected: int) -> None:
+    head = b"POST /photographs/preview HTTP/1.1\r\nHost: x\r\nConnection: close\r\nTransfer-Encoding: chunked\r\n\r\n"
+    chunk = b"%x\r\n" % size + b"x" * size + b"\r\n"
+    with server.connect() as connection:
+        connection.sendall(head + 2_500 * chunk + b"0\r\n\r\n")
+        status, _, body = read_to_end(connection)
+    assert status == expected
+    assert (b"pieces of less than 64 bytes" in body) == (status == 400)
+
+
+def test_small_bodies_one_after_another_are_no_crumbs() -> None:
+    connection = Connection(h11.SERVER)
+    for _ in range(MOST_CRUMBS + 1):
+        connection.receive_data(b"POST /cameras HTTP/1.1\r\nHost: x\r\nContent-Length: 2\r\n\r\n{}")
+        events = [connection.next_event() for _ in range(3)]
+        assert [type(event) for event in events] == [h11.Request, h11.Data, h11.EndOfMessage]
+        connection.send(h11.Response(status_code=204, headers=[]))
+        connection.send(h11.EndOfMessage())
+        connection.start_next_cycle()
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("GET http://127.0.0.1/health/live", 200),
+        ("GET HTTP://localhost:8000/cameras?limit=1", 200),
+        ("GET http://[::1]:8000", 200),
+        ("GET https://127.0.0.1?no=thing", 200),
+        ("GET http://stranger.example/cameras", 421),
+        ("GET http://stranger.example@127.0.0.1/cameras", 421),
+        ("OPTIONS *", 204),
+        ("GET *", 404),
+    ],
+)
+def test_a_target_may_name_the_host_which_counts(server: Server, line: str, expected: int) -> None:
+    host = "stranger.example" if expected == 200 else "localhost"
+    with server.connect() as connection:
+        connection.sendall(f"{line} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n".encode())
+        assert read_to_end(connection)[0] == expected
 
 
 def test_a_body_that_is_too_large_is_answered_though_it_was_sent_whole(server: Server) -> None:
