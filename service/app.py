@@ -31,6 +31,7 @@ from service.api.dependencies import require_known_parameters
 from service.api.problems import responses
 from service.api.uploads import Arrivals
 from service.calibration.calibrate import calibrate
+from service.compression import Compress
 from service.config import Settings
 from service.errors import BadRequest
 from service.inference.artifact import load_model_folder
@@ -103,6 +104,7 @@ def create_app(settings: Settings, calibrate: Calibrate = calibrate) -> FastAPI:
 
 def _add_middleware(app: FastAPI, settings: Settings) -> None:
     # the last one added is the outermost
+    app.add_middleware(Compress)
     photograph = BodyLimits(settings.max_image_bytes, settings.receive_deadline_s)
     app.add_middleware(
         LimitRequests,

@@ -1,7 +1,7 @@
 """Around every request, in pure ASGI: an id, one log event, metrics, limits on what is received, HEAD.
 
 From the outside in: ``access.AllowOrigins``, ``ObserveRequests``, ``AnswerHead``, ``access.Authenticate``,
-``LimitRequests``, then the routes. ``EndConnections`` is the server's, around all of them.
+``LimitRequests``, ``compression.Compress``, then the routes. ``EndConnections`` is the server's, around all of them.
 """
 
 import asyncio

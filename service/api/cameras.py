@@ -43,8 +43,9 @@ from service.storage.idempotency import once_of
 BODY_ERRORS = (BadRequest, UnsupportedKind)
 ETAG = {"ETag": {"description": "The revision, for If-Match", "schema": {"type": "string"}}}
 LOCATION = {"Location": {"description": "The camera's path", "schema": {"type": "string"}}}
-# another owner's camera, or another database's, has the same path and the same revision
-UNCACHED = {"Cache-Control": "no-store", "Vary": "Authorization"}
+# another owner's camera, or another database's, has the same path and the same revision; and what is compressed on its
+# way has a weak tag, which If-Match does not take
+UNCACHED = {"Cache-Control": "no-store, no-transform", "Vary": "Authorization"}
 CURVE_SPAN = 5.0
 CURVE_POINTS = 101
 REVISION_PATTERN = r"[1-9][0-9]{0,8}"
@@ -141,7 +142,6 @@ def read_camera(
 ) -> CameraRead | Response:
     """The camera at its current revision."""
     record = cameras.get(name)
-    response.headers.update(UNCACHED)
     answer = _answer(record, response)
     if _is_at_hand(record.revision, if_none_match):
         return Response(status_code=304, headers=response.headers)
@@ -234,7 +234,7 @@ def _drafted(data: bytes) -> Draft:
 
 
 def _answer(record: CameraRecord, response: Response) -> CameraRead:
-    response.headers["ETag"] = f'"{record.revision}"'
+    response.headers.update({**UNCACHED, "ETag": f'"{record.revision}"'})
     return CameraRead.from_record(record)
 
 
