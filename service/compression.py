@@ -36,7 +36,7 @@ class Compress:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        is_taken = takes_gzip(Headers(scope=scope).get("accept-encoding", ""))
+        is_taken = takes_gzip(",".join(Headers(scope=scope).getlist("accept-encoding")))
         compressor = None
 
         async def compressed(message: Message) -> None:

@@ -87,8 +87,8 @@ async def estimate_depth(
     pixel is NaN, in png 0.
     """
     chosen = choose_format(query.format, ", ".join(request.headers.getlist("accept")), FORMAT_TYPES)
-    upload = await receive_photograph(request)
     record = await run_in_threadpool(cameras.get, query.camera)
+    upload = await receive_photograph(request)
     order = Order.of(upload, record, query, (chosen,), ImageLimits.of(settings))
     outcome = await unless_gone(request, worker.run(sharer, fulfil, order, estimator))
     answer = outcome.value

@@ -57,8 +57,8 @@ async def look_at_photograph(
 
     Distance and tilt need a focal length: that of the camera if it is given and known, else that of the EXIF.
     """
-    upload = await receive_photograph(request)
     known = (await run_in_threadpool(cameras.get, camera)).draft.with_focal_length if camera else None
+    upload = await receive_photograph(request)
     order = Order(upload.data, grid, known, ImageLimits.of(settings))
     return (await unless_gone(request, worker.run(sharer, fulfil, order))).value
 

@@ -10,7 +10,7 @@ from starlette.testclient import TestClient
 
 from service.api.uploads import Arrivals
 from service.errors import Busy
-from tests.inference.photographs import corners, png
+from tests.inference.photographs import corners, never_read, png
 
 
 def test_what_arrives_all_together_is_bounded() -> None:
@@ -41,6 +41,11 @@ def test_too_much_at_once_is_busy_and_is_forgotten(app: FastAPI, client: TestCli
     app.state.arrivals = Arrivals(2 * len(body) + 1000)
     for _ in range(3):
         assert client.post("/photographs/preview", **sent).status_code == 200
+
+
+@pytest.mark.parametrize("path", ["/depth", "/calibrate/look"])
+def test_an_unknown_camera_is_told_before_a_photograph_is_received(client: TestClient, path: str) -> None:
+    assert client.post(path, params={"camera": "nobody"}, content=never_read()).status_code == 404
 
 
 @pytest.mark.parametrize("name", ["at", "nothing"])

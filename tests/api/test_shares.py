@@ -19,7 +19,7 @@ from service.errors import Busy
 from service.inference.cancellation import Cancellation
 from service.inference.worker import Outcome, Worker
 from tests.fake_calibration import FakeCalibration, calibration_form
-from tests.inference.photographs import corners, png
+from tests.inference.photographs import corners, never_read, png
 from tests.test_access import bearer
 
 ROOM = 8
@@ -107,11 +107,6 @@ def test_an_owner_who_sends_many_photographs_is_refused_before_another(
         answer = pool.submit(shared.post, "/photographs/preview", content=picture, headers=keys[1])
         release.set()
         assert answer.result().status_code == 200
-
-
-def never_read() -> Iterator[bytes]:
-    pytest.fail("a photograph that is refused was received")
-    yield b""
 
 
 def test_an_owner_who_sends_many_calibrations_waits_for_another_s(

@@ -2,10 +2,11 @@
 
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from service.opencv import cv2
@@ -14,6 +15,12 @@ Pixels = NDArray[Any]
 Order = Literal["<", ">"]
 ExifValue = int | float | str | tuple[int, int]
 ExifTags = Mapping[int, ExifValue]
+
+
+def never_read() -> Iterator[bytes]:
+    """A body that nobody may receive."""
+    pytest.fail("a photograph that is refused was received")
+    yield b""
 
 
 def corners(height: int = 48, width: int = 64) -> NDArray[np.uint8]:
