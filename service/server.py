@@ -32,9 +32,9 @@ KEEP_ALIVE_S = 75  # longer than what proxies keep: who closes last is never ask
 BACKLOG = 2048
 LET_IN = 16  # connections at a time, before one of them is looked at
 MOST_HEADER_BYTES = 65_536
-# a body may have this many pieces, and one more for so many of its bytes: each costs 10 microseconds, however small
+# a body may have this many chunks, and one more for so many of its bytes: each costs 10 microseconds, however small
 MOST_CRUMBS = 1_000
-CRUMB_BYTES = 64
+CRUMB_BYTES = 256
 ABSOLUTE_FORM = re.compile(rb"https?://([^/?#]+)(.*)", re.IGNORECASE)
 SPARE_FILES = 256  # of those the process may open: for the database, photographs, decoders, and a burst of connections
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
@@ -67,7 +67,7 @@ class HeadersTooLarge(BadRequest):
 
 
 class Crumbs(h11.RemoteProtocolError):
-    """A body in so many small pieces that taking them in would hold up everybody."""
+    """A body in so many small chunks that taking them in would hold up everybody."""
 
 
 class Connection(h11.Connection):
@@ -81,9 +81,9 @@ class Connection(h11.Connection):
             self._crumbs = 0
             return in_origin_form(event)
         if isinstance(event, h11.Data):
-            self._crumbs = max(0, self._crumbs + 1 - len(event.data) / CRUMB_BYTES)
+            self._crumbs = max(0, self._crumbs + event.chunk_start - len(event.data) / CRUMB_BYTES)
             if self._crumbs > MOST_CRUMBS:
-                raise Crumbs(f"The body comes in pieces of less than {CRUMB_BYTES} bytes: send it in larger ones.")
+                raise Crumbs(f"The body comes in chunks of less than {CRUMB_BYTES} bytes: send it in larger ones.")
         return event
 
 

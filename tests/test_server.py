@@ -106,7 +106,7 @@ def test_a_body_that_is_no_http_gets_a_problem(server: Server, method: str, paus
     assert "Traceback" not in server.log
 
 
-@pytest.mark.parametrize(("size", "expected"), [(1, 400), (32, 400), (64, 415)])
+@pytest.mark.parametrize(("size", "expected"), [(1, 400), (64, 400), (256, 413)])
 def test_a_body_in_crumbs_is_refused(server: Server, size: int, expected: int) -> None:
     head = b"POST /photographs/preview HTTP/1.1\r\nHost: x\r\nConnection: close\r\nTransfer-Encoding: chunked\r\n\r\n"
     chunk = b"%x\r\n" % size + b"x" * size + b"\r\n"
@@ -114,13 +114,14 @@ def test_a_body_in_crumbs_is_refused(server: Server, size: int, expected: int) -
         connection.sendall(head + 2_500 * chunk + b"0\r\n\r\n")
         status, _, body = read_to_end(connection)
     assert status == expected
-    assert (b"pieces of less than 64 bytes" in body) == (status == 400)
+    assert (b"chunks of less than 256 bytes" in body) == (status == 400)
 
 
 def test_small_bodies_one_after_another_are_no_crumbs() -> None:
     connection = Connection(h11.SERVER)
+    head = b"POST /cameras HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n"
     for _ in range(MOST_CRUMBS + 1):
-        connection.receive_data(b"POST /cameras HTTP/1.1\r\nHost: x\r\nContent-Length: 2\r\n\r\n{}")
+        connection.receive_data(head + b"2\r\n{}\r\n0\r\n\r\n")
         events = [connection.next_event() for _ in range(3)]
         assert [type(event) for event in events] == [h11.Request, h11.Data, h11.EndOfMessage]
         connection.send(h11.Response(status_code=204, headers=[]))
