@@ -162,7 +162,7 @@ def test_a_body_that_is_too_large_is_answered_though_it_was_sent_whole(server: S
 
 @pytest.mark.parametrize("version", ["1.0", "1.1"])
 def test_an_answer_comes_through_before_its_connection_is_closed(server: Server, version: str) -> None:
-    head = f"POST /depth?camera=x HTTP/{version}\r\nHost: x\r\nConnection: close\r\nContent-Type: text/plain\r\n"
+    head = f"POST /photographs/preview HTTP/{version}\r\nHost: x\r\nConnection: close\r\nContent-Type: text/plain\r\n"
     with server.connect() as connection:
         connection.sendall(f"{head}Content-Length: 150000\r\n\r\n".encode())
         for _ in range(15):
@@ -177,7 +177,7 @@ BOTH_LENGTHS = b"Content-Length: 2\r\nTransfer-Encoding: chunked\r\n\r\n2\r\n{}\
 @pytest.mark.parametrize("rest", [b"Expect: 100-continue\r\nContent-Length: 9\r\n\r\n", BOTH_LENGTHS])
 def test_a_connection_ends_where_a_body_could_be_taken_for_a_request(server: Server, rest: bytes) -> None:
     with server.connect() as connection:
-        connection.sendall(b"POST /depth?camera=x HTTP/1.1\r\nHost: x\r\nContent-Type: text/plain\r\n" + rest)
+        connection.sendall(b"POST /photographs/preview HTTP/1.1\r\nHost: x\r\nContent-Type: text/plain\r\n" + rest)
         status, headers, _ = read_to_end(connection)
     assert (status, headers["connection"]) == (415, "close")
 
@@ -243,7 +243,7 @@ def test_the_log_has_one_json_event_a_request(server: Server) -> None:
 
 def test_who_leaves_while_sending_is_no_fault_of_ours(server: Server) -> None:
     with server.connect() as client:
-        head = "POST /depth?camera=c HTTP/1.1\r\nHost: x\r\nX-Request-Id: leaver\r\nContent-Type: image/jpeg\r\n"
+        head = "POST /photographs/preview HTTP/1.1\r\nHost: x\r\nX-Request-Id: leaver\r\nContent-Type: image/jpeg\r\n"
         client.sendall(f"{head}Content-Length: 1000\r\n\r\nhalf".encode())
         time.sleep(0.2)
     events = server.poll(lambda: [json.loads(line) for line in server.log.splitlines() if "leaver" in line])
