@@ -76,6 +76,11 @@ class InvalidImage(BadRequest):
     code = "invalid-image"
     title = "Invalid image"
 
+    @classmethod
+    def cut_off(cls, kind: str) -> Self:
+        """The error for a file that ends early."""
+        return cls(f"The {kind} file is cut off: it ends before the picture does.")
+
 
 class ImageSizeMismatch(BadRequest):
     code = "image-size-mismatch"

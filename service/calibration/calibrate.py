@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.calibration import fit
-from service.calibration.edge import Spread, find_spread, fit_again
+from service.calibration.edge import PointSpread, find_spread, fit_again
 from service.calibration.measure import LEAST_CIRCLES, Measured, measure, otherwise_sized
 from service.calibration.pose import FEW_VIEWS, Placement, PoseError, place
 from service.calibration.report import Method, PictureReport, Report, Result, Role, Sample
@@ -114,7 +114,7 @@ class _Fitted:
 
     usable: list[Measured]
     placement: Placement
-    spread: Spread
+    spread: PointSpread
     circles: fit.Circles
     constants: fit.Constants
 

@@ -58,7 +58,7 @@ class EdgeError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
+class PointSpread:
     """The shape of a camera's defocus; a disc's rim is a Gaussian of ``softness_px``."""
 
     shape: Shape
@@ -111,15 +111,15 @@ def fit_edge(
     start = _start(patch, x_px - patch.left, y_px - patch.top, radius_px)
     if like is not None:
         start[2:7] = like.values[2:7]
-    best = _fitted(patch, start, Spread("gaussian"))
+    best = _fitted(patch, start, PointSpread("gaussian"))
     if best.blur_px > ALIKE_BELOW_PX:
-        disc = _fitted(patch, np.array(best.values), Spread("disc"))
+        disc = _fitted(patch, np.array(best.values), PointSpread("disc"))
         best = disc if disc.residual < CLEARLY * best.residual else best
     _check(best, x_px, y_px, radius_px)
     return best
 
 
-def fit_again(edge: EdgeFit, spread: Spread) -> EdgeFit:
+def fit_again(edge: EdgeFit, spread: PointSpread) -> EdgeFit:
     """The same disc under a point spread that is known for its camera.
 
     Small blur, which looks alike under all, is right only under the right one: a wrong one costs up to 8 %.
@@ -127,7 +127,7 @@ def fit_again(edge: EdgeFit, spread: Spread) -> EdgeFit:
     return _fitted(edge.patch, np.array(edge.values), spread)
 
 
-def find_spread(edges: Sequence[EdgeFit], gamma_px: float, tick: Callable[[], None]) -> Spread:
+def find_spread(edges: Sequence[EdgeFit], gamma_px: float, tick: Callable[[], None]) -> PointSpread:
     """The point spread that fits the most blurred of a camera's discs best; a Gaussian if none is clearly blurred.
 
     A lens's disc is about as soft as gamma, in focus or not. ``tick`` is called now and then.
@@ -135,18 +135,18 @@ def find_spread(edges: Sequence[EdgeFit], gamma_px: float, tick: Callable[[], No
     blurred = sorted(edges, key=lambda edge: edge.blur_px)[-SPREAD_DISCS:]
     blurred = [edge for edge in blurred if edge.blur_px > SPREAD_FROM * gamma_px]
 
-    def left_over(spread: Spread) -> float:
+    def left_over(spread: PointSpread) -> float:
         tick()
         return sum(math.log(max(fit_again(edge, spread).residual, 1e-9)) for edge in blurred)
 
     def of_disc(softness: float) -> float:
-        return left_over(Spread("disc", softness * gamma_px))
+        return left_over(PointSpread("disc", softness * gamma_px))
 
     if not blurred:
-        return Spread("gaussian")
+        return PointSpread("gaussian")
     best = minimize_scalar(of_disc, bounds=SOFTNESS_BOUNDS, method="bounded", options={"xatol": SOFTNESS_STEP})
-    is_disc = best.fun < left_over(Spread("gaussian"))
-    return Spread("disc", float(best.x) * gamma_px) if is_disc else Spread("gaussian")
+    is_disc = best.fun < left_over(PointSpread("gaussian"))
+    return PointSpread("disc", float(best.x) * gamma_px) if is_disc else PointSpread("gaussian")
 
 
 def slice_blur(light: NDArray[np.float32], x_px: float, y_px: float, radius_px: float) -> float:
@@ -201,7 +201,7 @@ def _start(patch: Patch, x: float, y: float, radius: float) -> Array:
     return np.array([x, y, math.log(radius), 0, 0, math.log(0.15 * radius), contrast, white, 0, 0])
 
 
-def _fitted(patch: Patch, start: Array, spread: Spread) -> EdgeFit:
+def _fitted(patch: Patch, start: Array, spread: PointSpread) -> EdgeFit:
     white, span = start[7], patch.side
     low = np.array([0, 0, math.log(2), -0.8, -0.8, math.log(0.15), 0.0, 0.2 * white, -white, -white])
     high = np.array([span, span, math.log(span), 0.8, 0.8, math.log(span / 3), 1.2, 3 * white, white, white])
@@ -250,7 +250,7 @@ def _semi_axes(radius: float, stretch: float, slant: float) -> tuple[float, floa
     return radius / math.sqrt(1 - amount), radius / math.sqrt(1 + amount)
 
 
-def _picture(values: Array, patch: Patch, spread: Spread) -> tuple[Array, Array]:
+def _picture(values: Array, patch: Patch, spread: PointSpread) -> tuple[Array, Array]:
     """The light [n] that the parameters (in the order of ``PARAMETERS``) make, and its slopes [n, parameters]."""
     x, y, log_radius, stretch, slant, log_blur, contrast, white, white_x, white_y = values
     radius = math.exp(log_radius)
@@ -307,7 +307,7 @@ def _distance(u: Array, v: Array, radius: float, stretch: float, slant: float) -
     return distance, by_shape
 
 
-def _profiles(at: Array, radius: Array, blur_px: Array, spread: Spread) -> Array:
+def _profiles(at: Array, radius: Array, blur_px: Array, spread: PointSpread) -> Array:
     """How much of point spreads at signed distance ``at`` [n] from circles' edges (outside positive) is inside: [k, n].
 
     Those are nearly alike: the first says which law is asked.

@@ -106,15 +106,10 @@ def read_header(data: bytes) -> Header:
     try:
         header = PARSERS[kind](data)
     except (struct.error, IndexError) as exc:
-        raise cut_off(str(kind)) from exc
+        raise InvalidImage.cut_off(str(kind)) from exc
     if header.width_px < 1 or header.height_px < 1:
         raise InvalidImage(f"The {header.kind} file states a size of {header.width_px}x{header.height_px} pixels.")
     return header
-
-
-def cut_off(kind: str) -> InvalidImage:
-    """The error for a file that ends early."""
-    return InvalidImage(f"The {kind} file is cut off: it ends before the picture does.")
 
 
 def _too_many_parts(kind: str) -> InvalidImage:
@@ -171,7 +166,7 @@ def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
         if marker == JPEG_SCAN:
             found = JPEG_MARKER_IN_SCAN.search(data, at)
             if found is None:
-                raise cut_off("jpeg")
+                raise InvalidImage.cut_off("jpeg")
             at = found.start()
     raise _too_many_parts("jpeg")
 
@@ -225,7 +220,7 @@ def picture_of_png(data: bytes) -> bytes:
 def _webp(data: bytes) -> Header:
     (length,) = struct.unpack_from("<I", data, 4)
     if length + 8 > len(data):
-        raise cut_off("webp")
+        raise InvalidImage.cut_off("webp")
     size: tuple[int, int] | None = None
     exif = profile = b""
     frames = 0
@@ -378,7 +373,7 @@ class TiffDirectory:
     def require_stored(self) -> None:
         """Raises ``InvalidImage`` where its picture leads out of the file."""
         if any(offset + count > len(self._data) for offset, count in self._stored()):
-            raise cut_off("tiff")
+            raise InvalidImage.cut_off("tiff")
 
     def require_own_bytes(self) -> None:
         """Raises ``InvalidImage`` where parts share bytes: each costs a decoder its time and memory anew."""

@@ -110,10 +110,6 @@ def _curve(data: bytes, at: int) -> int:
     return curve_of_profile(data[at + 4 : at - 8 + min(size, MOST_PROFILE_BYTES)])
 
 
-def _cut_off() -> InvalidImage:
-    return InvalidImage("The heic file is cut off: it ends before the picture does.")
-
-
 def _moved(corners: Corners, order: Corners) -> Corners:
     return corners[order[0]], corners[order[1]], corners[order[2]], corners[order[3]]
 
@@ -127,7 +123,7 @@ def _primary_properties(data: bytes) -> Iterator[tuple[bytes, int]]:
     if not {b"pitm", b"iprp"} <= inner.keys():
         raise InvalidImage("The heic file holds no picture.")
     if b"mdat" not in top and b"idat" not in inner:
-        raise _cut_off()
+        raise InvalidImage.cut_off("heic")
     at = inner[b"pitm"][0]
     primary = int.from_bytes(data[at + 4 : at + (8 if data[at] else 6)], "big")
     yield from _properties(data, *inner[b"iprp"], primary)
@@ -174,7 +170,7 @@ def _boxes(data: bytes, at: int, end: int) -> Iterator[tuple[bytes, int, int]]:
             start += 8
         stop = at + size if size else end
         if stop > end:
-            raise _cut_off()
+            raise InvalidImage.cut_off("heic")
         if stop < start:
             raise InvalidImage("The heic file is damaged: one of its boxes has no room for its head.")
         yield name, start, stop
