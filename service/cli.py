@@ -18,6 +18,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.config import DATABASE_FILE, Settings, SettingsError, load_settings
 from service.errors import BadRequest, CamindError, Conflict, NotFound
 from service.memory import end_uncollected, lasting
+from service.optics.camera import FOCUS_DISTANCES_M
 from service.principal import EVERYDAY, LOCAL, SCOPES
 
 if TYPE_CHECKING:
@@ -212,7 +213,10 @@ def calibrate(
     spacing_mm: Annotated[float, typer.Option(help="The spacing s of the grid, as measured on the sheet")] = 20.0,
     diameter_mm: Annotated[float, typer.Option(help="Of each circle")] = 12.0,
     focus_distance_m: Annotated[
-        float | None, typer.Option(min=0.001, max=100_000, help="Where the lens is focused. [default: found]")
+        float | None,
+        typer.Option(
+            min=FOCUS_DISTANCES_M[0], max=FOCUS_DISTANCES_M[1], help="Where the lens is focused. [default: found]"
+        ),
     ] = None,
     method: Literal["edge", "paper"] = "edge",
     out: Annotated[Path, typer.Option(help="Report to write; its plot goes beside it", dir_okay=False)] = Path(

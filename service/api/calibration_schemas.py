@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from service.api.cursors import NextCursor
 from service.api.problems import invalid_request
-from service.api.schemas import Given, IntrinsicsRead, Name
+from service.api.schemas import FocusDistance, Given, IntrinsicsRead, Name
 from service.calibration.edge import Shape
 from service.calibration.look import Exposure, Look
 from service.calibration.report import Method, Role
@@ -66,13 +66,8 @@ class CalibrationSettings(Given):
 
     pattern: Pattern
     focus_distance_m: Annotated[
-        float | None,
-        Field(
-            ge=0.01,
-            le=1_000,
-            allow_inf_nan=False,
-            description="Where the lens is focused; null: find it, which the method `paper` cannot",
-        ),
+        FocusDistance | None,
+        Field(description="Where the lens is focused; null: find it, which the method `paper` cannot"),
     ] = None
     method: Annotated[Method, Field(description="How the blur of a circle is read")] = "edge"
     # "register" is what every class of models can do already

@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema
 
+from service.api.schemas import FocusDistance
 from service.api.texts import Worded, numbers_in
 from service.inference.encode import MAPS, MapName
 from service.inference.known import KnownDepth
@@ -89,8 +90,7 @@ class DepthQuery(BaseModel):
         ),
     ] = None
     focus_distance_m: Annotated[
-        float | None,
-        Field(ge=0.001, le=100_000, allow_inf_nan=False, description="This shot's focus distance, if not the camera's"),
+        FocusDistance | None, Field(description="This shot's focus distance, if not the camera's")
     ] = None
 
     known: Annotated[

@@ -111,8 +111,8 @@ def problem_response(error: CamindError) -> Response:
 TAKEN = "A camera 'd200' exists already: replace it with PUT /cameras/d200."
 EXAMPLES: dict[str, tuple[str, tuple[FieldProblem, ...]]] = {
     "invalid-request": (
-        "lens.focal_length_mm: Input should be greater than or equal to 0.01",
-        (FieldProblem("#/lens/focal_length_mm", "Input should be greater than or equal to 0.01"),),
+        "lens.focal_length_mm: Input should be greater than or equal to 0.1",
+        (FieldProblem("#/lens/focal_length_mm", "Input should be greater than or equal to 0.1"),),
     ),
     "invalid-image": ("The jpeg file is cut off: it ends before the picture does.", ()),
     "image-size-mismatch": (

@@ -8,9 +8,10 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue
 from service.api.cursors import NextCursor
 from service.api.texts import Worded
 from service.errors import BadRequest
-from service.optics.camera import Camera, Intrinsics, Lens
+from service.optics.camera import FOCUS_DISTANCES_M, Camera, Intrinsics, Lens
 from service.storage.cameras import DEFAULT_K_R, NAME_PATTERN, CameraDraft, CameraRecord, Source
 
+LEAST_F_NUMBER = 0.5  # in air, where its light comes from a half space; the fastest lens that was made is f/0.7
 DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 PLAIN_TEXT = r"^[^\x00-\x08\x0b\x0c\x0e-\x1f\x7f]*$"
 NO_CONTROLS = "a description has no control characters except tabs and line breaks, and no unpaired surrogates"
@@ -23,7 +24,7 @@ Name = Annotated[
     Field(description="Unique; stands in the camera's URL", examples=["d200"]),
 ]
 Pixels = Annotated[int, Field(gt=0, le=100_000)]
-Metres = Annotated[float, Field(ge=0.001, le=100_000, allow_inf_nan=False)]
+FocusDistance = Annotated[float, Field(ge=FOCUS_DISTANCES_M[0], le=FOCUS_DISTANCES_M[1], allow_inf_nan=False)]
 BlurPixels = Annotated[float, Field(ge=1e-6, le=1_000_000, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
 
@@ -39,9 +40,17 @@ class LensSpecs(Given):
 
     focal_length_mm: Annotated[
         float,
-        Field(ge=0.01, le=10_000, allow_inf_nan=False, description="Real focal length, never the 35-mm equivalent"),
+        Field(ge=0.1, le=10_000, allow_inf_nan=False, description="Real focal length, never the 35-mm equivalent"),
     ]
-    f_number: Annotated[float, Field(ge=0.1, le=1_000, allow_inf_nan=False, description="Aperture number N")]
+    f_number: Annotated[
+        float,
+        Field(
+            ge=LEAST_F_NUMBER,
+            le=1_000,
+            allow_inf_nan=False,
+            description="Aperture number N; in air no lens has less than 0.5",
+        ),
+    ]
     pixel_pitch_um: Annotated[
         float, Field(ge=0.01, le=1_000, allow_inf_nan=False, description="Pitch of one sensor pixel")
     ]
@@ -112,7 +121,7 @@ class CameraSpecs(Given):
 
     image_width_px: Annotated[Pixels, Field(description="Width of the images it takes, upright")]
     image_height_px: Annotated[Pixels, Field(description="Height of the images it takes, upright")]
-    focus_distance_m: Annotated[Metres, Field(description="From the lens to the plane in focus")]
+    focus_distance_m: Annotated[FocusDistance, Field(description="From the lens to the plane in focus")]
     k_cam_px: Annotated[
         BlurPixels | None, Field(description="Blur per unit of relative defocus, at `image_width_px`")
     ] = None
@@ -379,7 +388,8 @@ def _fx_px(draft: CameraDraft) -> float | None:
 def _lens_read(lens: Lens | None) -> LensSpecs | None:
     if lens is None:
         return None
-    return LensSpecs(
+    # what is stored was good when it was: no bound is set to it
+    return LensSpecs.model_construct(
         focal_length_mm=lens.focal_length_mm,
         f_number=lens.f_number,
         pixel_pitch_um=lens.pixel_pitch_um,

@@ -41,7 +41,7 @@ LEAST_EXCESS = 0.05
 MISFIT = 0.1
 MUST_SHOW = 0.5  # of gamma, that the largest defocus must reach
 GAMMA_BOUNDS_PX = (0.02, 20.0)
-K_CAM_BOUNDS_PX = (0.01, 2000.0)
+K_CAM_BOUNDS_PX = (1e-6, 2000.0)  # of a lens focused at infinity next to nothing
 FOCUS_REACH = 3.0
 FOCUS_STARTS = 9
 

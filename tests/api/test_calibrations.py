@@ -319,7 +319,7 @@ def change_pattern(**change: JsonValue) -> dict[str, JsonValue]:
         ({"method": "guess"}, "#/settings/method"),
         ({"method": "paper"}, "#/settings/focus_distance_m"),
         ({"focus_distance_m": 0}, "#/settings/focus_distance_m"),
-        ({"focus_distance_m": 1001}, "#/settings/focus_distance_m"),
+        ({"focus_distance_m": 100_001}, "#/settings/focus_distance_m"),
         ({"focus_distance_m": "2"}, "#/settings/focus_distance_m"),
         ({"focus_distance_m": float("nan")}, "#/settings/focus_distance_m"),
         ({"pattern": None}, "#/settings/pattern"),

@@ -2,14 +2,18 @@
 
 import json
 import math
+from dataclasses import replace
 from datetime import datetime
 from typing import Any
 
 import pytest
+from fastapi import FastAPI
 from starlette.testclient import TestClient
 
 from service.api.cursors import cursor_after
 from service.optics import thin_lens
+from service.principal import LOCAL
+from service.storage.cameras import Cameras
 
 PROBLEM = "application/problem+json"
 
@@ -50,6 +54,36 @@ def test_k_r_divides_k_cam(client: TestClient, d200: dict[str, Any]) -> None:
     camera = client.post("/cameras", json=d200).json()
     assert camera["k_cam_px"] == pytest.approx(thin_lens.k_cam(35e-3, 2.8, 2.0, 6.05e-6, 645 / 3872, 2.0))
     assert camera["k_r"] == 2.0
+
+
+@pytest.mark.parametrize(
+    ("lens", "focus_distance_m"),
+    [
+        ([1.8, 0.53, 6.5, 2048], 0.0021),  # a microscope's objective of NA 0.95
+        ([50, 0.7, 6, 4000], 1.0),  # the fastest there was
+        ([100, 32, 3.7, 6000], 0.2),  # macro at 1:1
+        ([0.55, 2.8, 1.1, 400], 0.01),  # an endoscope's
+        ([7820, 22, 3.76, 6248], 100_000),  # a telescope with a Barlow lens
+        ([6.9, 1.8, 0.012, 8160], 3.0),  # a phone's digital zoom of 50 times, as its draft says it
+    ],
+)
+def test_lenses_that_there_are_become_cameras(
+    client: TestClient, d200: dict[str, Any], lens: list[float], focus_distance_m: float
+) -> None:
+    specs = dict(zip(LENS_NUMBERS, lens, strict=False))
+    answer = client.post("/cameras", json={**d200, "focus_distance_m": focus_distance_m, "lens": specs})
+    assert answer.status_code == 201, answer.text
+
+
+def test_a_lens_that_was_stored_when_bounds_were_wider_is_still_read(
+    client: TestClient, app: FastAPI, d200: dict[str, Any]
+) -> None:
+    client.post("/cameras", json=d200)
+    cameras = Cameras(app.state.engine, LOCAL)
+    draft = cameras.get("d200").draft
+    assert draft.lens
+    cameras.replace(replace(draft, lens=replace(draft.lens, f_number=0.3)))
+    assert client.get("/cameras/d200").json()["lens"]["f_number"] == 0.3
 
 
 def test_intrinsics_and_description_come_back_as_sent(client: TestClient, phone: dict[str, Any]) -> None:
@@ -228,6 +262,7 @@ def test_lens_specs_beside_the_camera_are_told_their_place(client: TestClient, d
 
 NUMBERS = ["image_width_px", "image_height_px", "focus_distance_m", "k_cam_px"]
 LENS_NUMBERS = ["focal_length_mm", "f_number", "pixel_pitch_um", "sensor_width_px", "k_r"]
+LENS = {"focal_length_mm": 35, "f_number": 2.8, "pixel_pitch_um": 6.05, "sensor_width_px": 3872}
 BAD = [
     "0",
     "-1",
@@ -286,6 +321,9 @@ def test_gamma_may_be_zero_and_not_less(client: TestClient, phone: dict[str, Any
         ({"description": "a\x00b"}, "#/description"),
         ({"description": "x" * 1001}, "#/description"),
         ({"lens": []}, "#/lens"),
+        ({"lens": {**LENS, "f_number": 0.49}}, "#/lens/f_number"),
+        ({"lens": {**LENS, "focal_length_mm": 0.05}}, "#/lens/focal_length_mm"),
+        ({"focus_distance_m": 100_001}, "#/focus_distance_m"),
         ({"intrinsics": {"fx_px": 1, "fy_px": 1, "cx_px": 0, "cy_px": 0, "skew": 0}}, "#/intrinsics/skew"),
         ({"intrinsics": {"fx_px": 1, "fy_px": 0, "cx_px": 0, "cy_px": 0}}, "#/intrinsics/fy_px"),
         (

@@ -35,6 +35,14 @@ def test_both_sides_of_focus_give_all_three() -> None:
         assert interval.low <= interval.value <= interval.high
 
 
+def test_a_lens_focused_at_infinity_has_its_k_cam() -> None:
+    k_cam, focus_m = 7e-5, 100_000.0
+    some = circles(BOTH_SIDES, error=0.0)
+    blur = np.asarray(thin_lens.blur_at_depth(some.depth_m, focus_m, k_cam, GAMMA))
+    found = fit_constants(replace(some, blur_px=blur), focus_m, resamples=0)
+    assert found.k_cam_px.value == pytest.approx(k_cam, rel=1e-3)
+
+
 def test_exact_circles_are_fitted_exactly() -> None:
     found = fit_constants(circles(BOTH_SIDES, error=0.0), resamples=5)
     assert found.k_cam_px.value == pytest.approx(K_CAM, rel=1e-4)
