@@ -15,11 +15,11 @@ import tifffile
 from service.opencv import cv2
 from tests.fake_calibration import SETTINGS
 from tests.inference.heics import heic
-from tests.inference.photographs import corners, encoded, exif_block, jpeg, png, png_chunk, tiff, webp
+from tests.inference.photographs import avif, corners, encoded, exif_block, jpeg, png, png_chunk, tiff, webp
 from tests.inference.raws import dng, with_preview
 
 SEED = 20261122
-ISOLATED = frozenset({"heic", "raw"})
+ISOLATED = frozenset({"heic", "avif", "raw"})
 ISOLATED_SHARE = 0.04
 BOUNDARY = b"fuzz"
 # what length fields and dimensions are blown up to
@@ -140,6 +140,7 @@ def _files() -> dict[str, list[bytes]]:
         ],
         "webp": [webp(rgb, 6), webp(scene), lossy],
         "heic": [heic(3), heic(1, 1), heic(crop=None)],
+        "avif": [avif(rgb, 6), avif(rgb, 1, scene)],
         "raw": [dng(6), dng(), with_preview()],
     }
 

@@ -12,6 +12,7 @@ MADE = {
     "image/png": [photographs.png(photographs.corners(*size), orientation=1) for size in SIZES],
     "image/tiff": [photographs.tiff(photographs.corners(*size)) for size in SIZES],
     "image/webp": [photographs.webp(photographs.corners(*size)) for size in SIZES],
+    "image/avif": [photographs.avif(photographs.corners(*size)) for size in SIZES],
 }
 EVERY = [body for bodies in MADE.values() for body in bodies]
 

@@ -9,21 +9,22 @@ import re
 import struct
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from service.errors import InvalidImage, UnsupportedKind
-from service.inference.heic import curve_of_primary, exif_item, primary_picture
+from service.inference.heic import curve_of_primary, exif_item, is_animated, kind_of, primary_picture
 from service.inference.tone_curve import CURVES, SRGB, curve_of_profile, unpacked_profile
 
-Kind = Literal["jpeg", "png", "tiff", "webp", "heic", "raw"]
+Kind = Literal["jpeg", "png", "tiff", "webp", "heic", "avif", "raw"]
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_READ = frozenset({b"IHDR", b"eXIf", b"acTL", b"cICP", b"iCCP"})
 PNG_ANCILLARY = 0x20  # of a chunk's first letter: no part of the picture (ISO/IEC 15948, 5.4)
 EXIF_SIGNATURE = b"Exif\x00\x00"
 ICC_SIGNATURE, ICC_NUMBERING = b"ICC_PROFILE\x00", 2
-HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"mif1"})
+# of RAF, ORF, RW2, X3F and CR3
+OTHER_RAW = re.compile(rb"FUJIFILMCCD-RAW|IIR[OS]|MMOR|IIU\0|FOVb|....ftypcrx ", re.DOTALL)
 JPEG_MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
 JPEG_FILL = re.compile(rb"\xff*(?=\xff)")
 JPEG_END, JPEG_SCAN, JPEG_STEPS, JPEG_APP1, JPEG_APP2 = 0xD9, 0xDA, 0xDB, 0xE1, 0xE2
@@ -89,9 +90,7 @@ def sniff(data: bytes) -> Kind | None:
         return "tiff"
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
         return "webp"
-    if data[4:8] == b"ftyp" and data[8:12] in HEIC_BRANDS:
-        return "heic"
-    return None
+    return kind_of(data)
 
 
 def read_header(data: bytes) -> Header:
@@ -100,8 +99,10 @@ def read_header(data: bytes) -> Header:
         raise InvalidImage("The file is empty: send the bytes of one photograph.")
     kind = sniff(data)
     if kind is None:
+        if OTHER_RAW.match(data):
+            raise UnsupportedKind("Raw files of this kind are not read: convert it to DNG, or send the camera's JPEG.")
         raise UnsupportedKind(
-            "This is not a JPEG, PNG, TIFF, WebP, HEIC or DNG file: send a photograph of one of these kinds."
+            "This is not a JPEG, PNG, TIFF, WebP, HEIC, AVIF or DNG file: send a photograph of one of these kinds."
         )
     try:
         header = PARSERS[kind](data)
@@ -317,6 +318,10 @@ def _heic(data: bytes) -> Header:
     return Header("heic", *primary_picture(data), exif=exif_item(data), curve=curve_of_primary(data))
 
 
+def _avif(data: bytes) -> Header:
+    return replace(_heic(data), kind="avif", has_more=is_animated(data))
+
+
 def _exif_orientation(data: bytes) -> int:
     """Orientation 1..8 from an EXIF block; a block that cannot be read says nothing, which is 1."""
     try:
@@ -449,4 +454,5 @@ PARSERS: dict[Kind, Callable[[bytes], Header]] = {
     "tiff": _tiff,
     "webp": _webp,
     "heic": _heic,
+    "avif": _avif,
 }

@@ -1,13 +1,17 @@
-"""What a HEIC's boxes say of its primary picture: the size, curve and the turn its decoder applies; and its EXIF."""
+"""What a HEIC's or AVIF's boxes say of its primary picture: the size, curve and turn to upright; and its EXIF."""
 
 import struct
 from collections.abc import Iterator
 from io import BytesIO
 from itertools import islice
+from typing import Literal
 
 from service.errors import InvalidImage
 from service.inference.tone_curve import CURVES, MOST_PROFILE_BYTES, SRGB, curve_of_profile
 
+HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"mif1"})
+AVIF_BRANDS, ANIMATED = frozenset({b"avif", b"avis"}), b"avis"
+MOST_BRANDS = 32
 MOST_BOXES = 20_000
 MOST_LISTS = 8
 # where the corners of the stored picture, numbered row by row, stand upright, by EXIF orientation
@@ -24,6 +28,22 @@ ORIENTATIONS = {
 QUARTER_LEFT, TOP_TO_BOTTOM, LEFT_TO_RIGHT = (1, 3, 0, 2), (2, 3, 0, 1), (1, 0, 3, 2)
 
 Corners = tuple[int, int, int, int]
+
+
+def kind_of(data: bytes) -> Literal["heic", "avif"] | None:
+    """By its brands, of which a file of the standard's own, mif1, has others too; None for none of these files."""
+    if data[4:8] != b"ftyp":
+        return None
+    end = min(int.from_bytes(data[:4], "big"), 16 + 4 * MOST_BRANDS, len(data))
+    brands = {data[8:12], *(data[at : at + 4] for at in range(16, end, 4))}
+    if brands & AVIF_BRANDS:
+        return "avif"
+    return "heic" if data[8:12] in HEIC_BRANDS else None
+
+
+def is_animated(data: bytes) -> bool:
+    """Whether it is an AVIF of several frames."""
+    return data[8:12] == ANIMATED
 
 
 def primary_picture(data: bytes) -> tuple[int, int, int]:
@@ -117,13 +137,13 @@ def _moved(corners: Corners, order: Corners) -> Corners:
 def _primary_properties(data: bytes) -> Iterator[tuple[bytes, int]]:
     top = {name: (start, end) for name, start, end in _boxes(data, 0, len(data))}
     if b"meta" not in top:
-        raise InvalidImage("The heic file holds no picture.")
+        raise InvalidImage(f"The {kind_of(data)} file holds no picture.")
     start, end = top[b"meta"]
     inner = {name: (start, end) for name, start, end in _boxes(data, start + 4, end)}
     if not {b"pitm", b"iprp"} <= inner.keys():
-        raise InvalidImage("The heic file holds no picture.")
+        raise InvalidImage(f"The {kind_of(data)} file holds no picture.")
     if b"mdat" not in top and b"idat" not in inner:
-        raise InvalidImage.cut_off("heic")
+        raise InvalidImage.cut_off(str(kind_of(data)))
     at = inner[b"pitm"][0]
     primary = int.from_bytes(data[at + 4 : at + (8 if data[at] else 6)], "big")
     yield from _properties(data, *inner[b"iprp"], primary)
@@ -170,9 +190,9 @@ def _boxes(data: bytes, at: int, end: int) -> Iterator[tuple[bytes, int, int]]:
             start += 8
         stop = at + size if size else end
         if stop > end:
-            raise InvalidImage.cut_off("heic")
+            raise InvalidImage.cut_off(str(kind_of(data)))
         if stop < start:
-            raise InvalidImage("The heic file is damaged: one of its boxes has no room for its head.")
+            raise InvalidImage(f"The {kind_of(data)} file is damaged: one of its boxes has no room for its head.")
         yield name, start, stop
         at = stop
-    raise InvalidImage(f"The heic file has more than {MOST_BOXES} boxes.")
+    raise InvalidImage(f"The {kind_of(data)} file has more than {MOST_BOXES} boxes.")

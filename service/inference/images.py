@@ -1,8 +1,8 @@
 """The only door for photographs: bytes in, upright RGB out.
 
 Kind, size and wholeness are decided on the header, before anything is decoded. EXIF orientation is applied
-here and nowhere else; a calibration, which measures the lens, asks for the stored frame. HEIC and raw files are
-decoded in a process of their own.
+here and nowhere else; a calibration, which measures the lens, asks for the stored frame. HEIC, AVIF and raw files
+are decoded in a process of their own.
 """
 
 from dataclasses import dataclass, field
@@ -27,6 +27,7 @@ MEDIA_TYPES: dict[str, Kind] = {
     "image/webp": "webp",
     "image/heic": "heic",
     "image/heif": "heic",
+    "image/avif": "avif",
     "image/x-adobe-dng": "raw",
     "image/x-canon-cr2": "raw",
     "image/x-nikon-nef": "raw",
@@ -34,12 +35,28 @@ MEDIA_TYPES: dict[str, Kind] = {
 }
 # what some browsers and programs call them
 ALIASES: dict[str, Kind] = {"image/jpg": "jpeg", "image/pjpeg": "jpeg", "image/x-png": "png"}
+ISOLATED = frozenset({"heic", "avif", "raw"})
 CURL_S_OWN = "application/x-www-form-urlencoded"
 UNDECLARED = frozenset({"", "application/octet-stream", "image/*"})
 
 # how files of these kinds end
 SUFFIXES = frozenset(
-    {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic", ".heif", ".hif", ".dng", ".cr2", ".nef", ".arw"}
+    {
+        ".jpg",
+        ".jpeg",
+        ".png",
+        ".tif",
+        ".tiff",
+        ".webp",
+        ".heic",
+        ".heif",
+        ".hif",
+        ".avif",
+        ".dng",
+        ".cr2",
+        ".nef",
+        ".arw",
+    }
 )
 
 # (transposed, flipped left-right, flipped top-bottom), in this order, by EXIF orientation
@@ -163,11 +180,11 @@ def _read(data: bytes, limits: ImageLimits) -> tuple[Header, NDArray[np.uint8], 
         raise TooLarge(f"The file has {len(data)} bytes, more than the {limits.max_bytes} accepted.")
     header = read_header(data)
     _require_size(header.width_px, header.height_px, limits)
-    if header.kind not in ("heic", "raw"):
+    if header.kind not in ISOLATED:
         return header, *_decode(data, header)
     stored = decode_isolated(header.kind, data, min(limits.max_pixels, PIXEL_CEILING))
     _require_size(stored.shape[1], stored.shape[0], limits)
-    return header, _unturned_pixels(stored, header) if header.kind == "heic" else stored, ()
+    return header, stored if header.kind == "raw" else _stored_pixels(stored, header), ()
 
 
 def _require_size(width_px: int, height_px: int, limits: ImageLimits) -> None:
@@ -214,9 +231,9 @@ def _eight_bits(pixels: NDArray[Any]) -> tuple[NDArray[np.uint8], tuple[str, ...
     return np.asarray(pixels, np.uint8), warnings
 
 
-def _unturned_pixels(upright: NDArray[np.uint8], header: Header) -> NDArray[np.uint8]:
-    """The stored frame of a HEIC, whose decoder turns it."""
-    stored = turned(upright, UNTURNS[header.orientation])
+def _stored_pixels(decoded: NDArray[np.uint8], header: Header) -> NDArray[np.uint8]:
+    """The stored frame of a HEIC, whose decoder turns it, or of an AVIF, whose does not."""
+    stored = turned(decoded, UNTURNS[header.orientation]) if header.kind == "heic" else decoded
     if stored.shape[:2] != (header.height_px, header.width_px):
-        raise InvalidImage("The heic file's picture is not of the size that it states.")
+        raise InvalidImage(f"The {header.kind} file's picture is not of the size that it states.")
     return stored

@@ -1,4 +1,4 @@
-"""Decoders that are not trusted with the service's own process: HEIC and raw files.
+"""Decoders that are not trusted with the service's own process: HEIC, AVIF and raw files.
 
 Each file gets a process of its own, with bounds on memory and time, nothing of the service's environment and no way to
 open anything. One that hangs, dies or answers nonsense is a damaged file; the service goes on.
@@ -21,7 +21,7 @@ from service.errors import Busy, InvalidImage, TooLarge, UnsupportedKind
 from service.inference.isolated_decoder import DECODED, HEAD, TOO_LARGE
 
 PROGRAM = Path(__file__).with_name("isolated_decoder.py")
-# the module that decodes a kind, and the extra that brings it
+# the module that decodes a kind, and the extra that brings it; what decodes AVIF is always there
 MODULES = {"heic": ("pi_heif", "heic"), "raw": ("rawpy", "raw")}
 CPU_S = 30
 WALL_S = 60.0
@@ -31,11 +31,11 @@ ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
 def decode_isolated(kind: str, data: bytes, max_pixels: int) -> NDArray[np.uint8]:
-    """The pixels [h, w, 3] RGB of a HEIC, upright, or of a raw file, as stored.
+    """The pixels [h, w, 3] RGB of a HEIC, upright, or of an AVIF or raw file, as stored.
 
     Raises ``UnsupportedKind`` without the extra, ``TooLarge``, ``InvalidImage`` and ``Busy``.
     """
-    module, extra = MODULES[kind]
+    module, extra = MODULES.get(kind, ("PIL", ""))
     if importlib.util.find_spec(module) is None:
         raise UnsupportedKind(f"A {kind} file needs the service's extra '{extra}', which is not installed: send JPEG.")
     memory_bytes = MEMORY_BYTES + MEMORY_BYTES_PER_PIXEL * max_pixels

@@ -1,7 +1,7 @@
-"""The program that decodes HEIC and raw files, in a process of its own: it imports nothing of the service.
+"""The program that decodes HEIC, AVIF and raw files, in a process of its own: it imports nothing of the service.
 
 ``python -I isolated_decoder.py KIND MAX_PIXELS MEMORY_BYTES CPU_S`` takes the file on its standard input. Out go a
-status, width and height, and after ``DECODED`` the pixels, 8-bit RGB in sRGB, a HEIC's upright and a raw's as stored.
+status, width and height, and after ``DECODED`` the pixels, 8-bit RGB in sRGB, a HEIC's upright, others as stored.
 """
 
 import os
@@ -52,6 +52,20 @@ def heic(data: bytes) -> Opened:
     return *picture.size, decode
 
 
+def avif(data: bytes) -> Opened:
+    """The first picture of an AVIF: its stated size, and how to decode it, as stored."""
+    from PIL import AvifImagePlugin, TiffImagePlugin  # noqa: F401 the second would be imported later, for EXIF
+
+    AvifImagePlugin.DEFAULT_MAX_THREADS = 1
+    shut_off()
+    picture = AvifImagePlugin.AvifImageFile(BytesIO(data))
+
+    def decode() -> Decoded:
+        return *picture.size, picture.convert("RGB").tobytes()
+
+    return *picture.size, decode
+
+
 def raw(data: bytes) -> Opened:
     """A raw file: its stated size, and how to develop it, in the camera's white balance and no brighter."""
     import rawpy
@@ -70,7 +84,7 @@ def raw(data: bytes) -> Opened:
     return picture.sizes.iwidth, picture.sizes.iheight, decode
 
 
-DECODERS: dict[str, Callable[[bytes], Opened]] = {"heic": heic, "raw": raw}
+DECODERS: dict[str, Callable[[bytes], Opened]] = {"heic": heic, "avif": avif, "raw": raw}
 
 
 def main(kind: str, max_pixels: int, memory_bytes: int, cpu_s: int) -> None:

@@ -3,11 +3,13 @@
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
+from io import BytesIO
 from typing import Any, Literal
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 
 from service.opencv import cv2
 
@@ -120,6 +122,16 @@ def webp(rgb: Pixels, orientation: int | None = None, exif: bytes | None = None)
     extended = b"VP8X" + struct.pack("<I", 10) + b"\x08\x00\x00\x00" + size
     chunks = extended + data[start:] + b"EXIF" + struct.pack("<I", len(exif)) + exif + bytes(len(exif) % 2)
     return b"RIFF" + struct.pack("<I", len(chunks) + 4) + b"WEBP" + chunks
+
+
+def avif(rgb: Pixels, orientation: int = 1, *others: Pixels) -> bytes:
+    """An AVIF of EXIF that says its maker, turned by its own boxes; with others it is one of several frames."""
+    exif, body = Image.Exif(), BytesIO()
+    exif[271], exif[274] = "Maker", orientation
+    pictures = [Image.fromarray(picture) for picture in (rgb, *others)]
+    options = {"quality": 95, "subsampling": "4:4:4", "speed": 10, "exif": exif.tobytes(), "save_all": bool(others)}
+    pictures[0].save(body, "AVIF", append_images=pictures[1:], **options)
+    return body.getvalue()
 
 
 def tiff(rgb: NDArray[np.uint8] | NDArray[np.uint16], orientation: int = 1, order: Order = "<") -> bytes:

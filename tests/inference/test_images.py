@@ -185,6 +185,15 @@ def test_bytes_that_are_no_listed_kind_are_refused(data: bytes) -> None:
         read_photograph(data, "image/jpeg")
 
 
+@pytest.mark.parametrize(
+    "data",
+    [b"FUJIFILMCCD-RAW 0201", b"IIRO\x08\0\0\0", b"MMOR\0\0\0\x08", b"IIU\0\x18\0\0\0", b"\0\0\0\x18ftypcrx \0\0\0\1"],
+)
+def test_a_raw_file_of_a_kind_that_is_not_read_is_told_what_to_become(data: bytes) -> None:
+    with pytest.raises(UnsupportedKind, match="convert it to DNG"):
+        read_photograph(data)
+
+
 def test_an_empty_body_is_refused() -> None:
     with pytest.raises(InvalidImage, match="empty"):
         read_photograph(b"", "image/jpeg")

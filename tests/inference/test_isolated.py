@@ -1,4 +1,4 @@
-"""HEIC and raw files: turned and limited as any other, and their decoders can hang, swell or die without harm."""
+"""HEIC, AVIF and raw files: turned and limited as any other, and their decoders can hang, swell or die without harm."""
 
 import json
 import struct
@@ -15,7 +15,7 @@ from service.inference import isolated
 from service.inference.headers import read_header
 from service.inference.images import TURNS, ImageLimits, read_photograph, read_stored_frame, turned
 from tests.inference.heics import box, heic, whole
-from tests.inference.photographs import corners, png, tiff
+from tests.inference.photographs import avif, corners, png, tiff
 from tests.inference.raws import dng, with_preview
 
 CAMERA = {"name": "bench", "image_width_px": 64, "image_height_px": 48, "focus_distance_m": 2.0, "k_cam_px": 6.0}
@@ -131,6 +131,41 @@ def test_boxes_without_end_are_limited_and_cheap() -> None:
         read_header(data[: data.index(b"meta") - 4] + meta + box(b"mdat", bytes(1_000_000)))
     with pytest.raises(InvalidImage, match="boxes"):
         read_header(data + box(b"free") * 20_000)
+
+
+@pytest.mark.parametrize("orientation", [1, 5, 6])
+def test_an_avif_is_turned_exactly_once(orientation: int) -> None:
+    data = avif(corners(), orientation)
+    photograph = read_photograph(data, "image/avif")
+    assert (photograph.kind, photograph.orientation, photograph.warnings) == ("avif", orientation, ())
+    assert photograph.exif.make == "Maker"
+    near(photograph.rgb, turned(corners(), orientation))
+    if orientation == 6:
+        near(read_stored_frame(data), corners())
+
+
+def test_an_avif_is_known_by_its_brands_and_its_first_frame_is_read() -> None:
+    data = avif(corners())
+    named = data.replace(b"ftypavif", b"ftypmif1", 1)
+    assert (read_header(named).kind, read_header(heic().replace(b"ftypheic", b"ftypmif1", 1)).kind) == ("avif", "heic")
+    photograph = read_photograph(avif(corners(), 1, corners()[::-1]))
+    assert photograph.warnings == ("the file has more than one picture: the first was read",)
+    near(photograph.rgb, corners())
+
+
+def test_an_avif_is_measured_before_a_decoder_starts_and_a_damaged_one_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    data = avif(corners())
+    with pytest.raises(InvalidImage, match="avif"):
+        read_photograph(data[:-30] + bytes(30))
+    monkeypatch.setattr(isolated, "PROGRAM", Path("/nowhere"))
+    at = data.index(b"ispe") + 8
+    with pytest.raises(TooLarge, match="30000x30000"):
+        read_photograph(data[:at] + struct.pack(">II", 30_000, 30_000) + data[at + 8 :])
+    for length in range(12, len(data) - 1, 3):
+        with pytest.raises(InvalidImage, match="avif"):
+            read_header(data[:length])
 
 
 @pytest.mark.parametrize("orientation", [1, 6])
