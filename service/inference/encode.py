@@ -32,6 +32,7 @@ SAMPLES = 2**16
 # towards the corners of a wide lens 20 rounds are too few; a place that no ray meets is left out, and costs all of them
 UNDISTORTING = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-6)
 LENS_CELL_PX, MOST_OFF_PX = 8, 0.5
+RAY_CELL_PX, MOST_BENT_PX = 4, 0.01
 PERCENTILES = (0, 5, 50, 95, 100)
 GDAL_NODATA = (42113, "s", 0, "nan", True)  # the tag by which GDAL knows what is no answer
 COMMENT_LETTERS = 200  # what reads PLY takes lines of 1,000 or so
@@ -236,12 +237,39 @@ def _distortion(answer: DepthMap) -> NDArray[np.float64]:
 
 
 def _rays(answer: DepthMap, u: NDArray[np.intp], v: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Where pixels look: x and y [2, n] at a depth of 1, without the lens' distortion."""
-    matrix, distortion = camera_matrix(answer), _distortion(answer)
-    if not distortion.any() or len(u) == 0:
+    """Where pixels look: x and y [2, n] at a depth of 1, without the lens' distortion.
+
+    That is looked for on a grid, and between its places linear where that is right to a hundredth of a pixel.
+    """
+    matrix = camera_matrix(answer)
+    if not _distortion(answer).any() or len(u) == 0:
         return np.stack([(u - matrix[0, 2]) / matrix[0, 0], (v - matrix[1, 2]) / matrix[1, 1]])
+    height, width = answer.depth_m.shape
+    down, across = (np.arange(0, size + RAY_CELL_PX, RAY_CELL_PX) for size in (height, width))
+    corners = _grid_rays(answer, down, across).astype(np.float32)
+    to_corners = np.array([[1 / RAY_CELL_PX, 0, 0], [0, 1 / RAY_CELL_PX, 0]])
+    linear = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    rays = np.stack([cv2.warpAffine(values, to_corners, (width, height), flags=linear)[v, u] for values in corners])
+    between = (corners[:, :-1, :-1] + corners[:, :-1, 1:] + corners[:, 1:, :-1] + corners[:, 1:, 1:]) / 4
+    off = _grid_rays(answer, down[:-1] + RAY_CELL_PX / 2, across[:-1] + RAY_CELL_PX / 2) - between
+    is_bent = ~(np.hypot(*off) * matrix[0, 0] <= MOST_BENT_PX)
+    if is_bent.any():
+        alone = is_bent[v // RAY_CELL_PX, u // RAY_CELL_PX]
+        rays[:, alone] = _undistorted(answer, u[alone], v[alone])
+    return rays
+
+
+def _grid_rays(answer: DepthMap, down: NDArray[Any], across: NDArray[Any]) -> NDArray[np.float64]:
+    """Where the places of a grid look: x and y [2, h, w] at a depth of 1."""
+    u, v = (places.ravel() for places in np.meshgrid(across, down))
+    return _undistorted(answer, u, v).reshape(2, len(down), len(across))
+
+
+def _undistorted(answer: DepthMap, u: NDArray[Any], v: NDArray[Any]) -> NDArray[np.float64]:
+    """Where places look, each by its own search, which takes long for all of a photograph."""
     places = np.stack([u, v], 1).astype(np.float64)[:, None]
-    return np.asarray(cv2.undistortPoints(places, matrix, distortion, criteria=UNDISTORTING), np.float64)[:, 0].T
+    found = cv2.undistortPoints(places, camera_matrix(answer), _distortion(answer), criteria=UNDISTORTING)
+    return np.asarray(found, np.float64)[:, 0].T
 
 
 def _is_met(answer: DepthMap) -> NDArray[np.bool_]:
@@ -254,7 +282,7 @@ def _is_met(answer: DepthMap) -> NDArray[np.bool_]:
     if not distortion.any():
         return np.ones((len(down) - 1, len(across) - 1), np.bool_)
     u, v = (places.ravel() for places in np.meshgrid(across, down))
-    ahead = np.column_stack([*_rays(answer, u, v), np.ones(len(u))])
+    ahead = np.column_stack([*_undistorted(answer, u, v), np.ones(len(u))])
     back = cv2.projectPoints(ahead, np.zeros(3), np.zeros(3), camera_matrix(answer), distortion)[0][:, 0]
     is_met = (np.hypot(*(back - np.stack([u, v], 1)).T) <= MOST_OFF_PX).reshape(len(down), len(across))
     return np.asarray(is_met[:-1, :-1] & is_met[1:, :-1] & is_met[:-1, 1:] & is_met[1:, 1:])

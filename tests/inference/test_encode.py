@@ -3,6 +3,7 @@
 import io
 import json
 from dataclasses import replace
+from typing import Any
 from zipfile import ZipFile
 
 import numpy as np
@@ -192,6 +193,36 @@ def test_points_leave_the_lens_distortion_out(answer: DepthMap) -> None:
     np.testing.assert_allclose(np.asarray(places)[:, 0], np.stack([u, v], 1), atol=0.01)
     with np.load(io.BytesIO(encode_npz(bent, BESIDE).body)) as stored:
         np.testing.assert_array_equal(stored["distortion"], distortion)
+
+
+def test_points_of_a_large_picture_leave_distortion_out_without_a_search_for_each(
+    answer: DepthMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    size, terms = (240, 320), (-0.2, 0.05, 1e-3, -1e-3, 0)
+    lens = Intrinsics(400.0, 405.0, 170.0, 110.0, terms)
+    valid = np.ones(size, np.bool_)
+    valid[::7] = False
+    large = replace(
+        answer,
+        depth_m=np.linspace(0.5, 3, valid.size, dtype=np.float32).reshape(size),
+        valid=valid,
+        camera=Camera(320, 240, 1.0, 6.0, intrinsics=lens),
+    )
+    sought: list[int] = []
+    undistort = cv2.undistortPoints
+
+    def counting(places: Any, *others: Any, **options: Any) -> Any:
+        sought.append(len(places))
+        return undistort(places, *others, **options)
+
+    monkeypatch.setattr(cv2, "undistortPoints", counting)
+    body = encode_ply(large, Beside(np.zeros((*size, 3), np.uint8))).body.partition(b"end_header\n")[2]
+    assert sum(sought) < valid.size / 4
+    points = np.frombuffer(body, np.dtype([(axis, "<f4") for axis in "xyz"] + [(colour, "u1") for colour in "rgb"]))
+    ahead = np.stack([points[axis] for axis in "xyz"], 1).astype(np.float64)
+    places = cv2.projectPoints(ahead, np.zeros(3), np.zeros(3), np.array(lens.matrix), np.array(terms))[0][:, 0]
+    off = np.hypot(*(places - np.stack(np.nonzero(valid)[::-1], 1)).T)
+    assert off.max() <= 0.012
 
 
 @pytest.mark.parametrize(("cx_px", "cy_px"), [(-10.0, 14.5), (49.0, 14.5), (5.0, -15.0), (34.0, 44.0)])
