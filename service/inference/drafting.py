@@ -19,7 +19,9 @@ SENSOR_WIDTHS_MM = (1.0, 70.0)
 # of the long side to the short one; others are cut out of one of these
 SENSOR_ASPECTS = (4 / 3, 3 / 2)
 ASPECT_TOLERANCE = 0.02
-SAME_WIDTH = 1.25  # a square cut out of 4:3 is taken for wider by less, a sensor's part or another lens by more
+# what is told of one width differs by less, an equivalent's rounding included; of a phone's other lens by more
+SAME_WIDTH = 1.1
+SAME_CUT_WIDTH = 1.25  # a square cut out of 4:3 is taken for wider by less, a sensor's part by more
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,8 +163,9 @@ def _sensor_width_mm(exif: Exif, sensor_width_px: int | None, aspect: float, war
     if not found:
         return None
     roughest_mm = found[0 if exif.is_zoomed else -1][0]
-    width_mm, told = next(one for one in found if _is_about(one[0], roughest_mm))
-    if others := ", ".join(f"{other_mm:.3g}" for other_mm, _ in found if not _is_about(other_mm, width_mm)):
+    most = SAME_WIDTH if _is_whole(aspect) else SAME_CUT_WIDTH
+    width_mm, told = next(one for one in found if _is_within(most, one[0], roughest_mm))
+    if others := ", ".join(f"{other_mm:.3g}" for other_mm, _ in found if not _is_within(most, other_mm, width_mm)):
         warnings.append(
             f"the sensor is taken as {width_mm:.3g} mm wide, where the EXIF or a list of cameras also says {others}: "
             "check lens.pixel_pitch_um"
@@ -171,8 +174,13 @@ def _sensor_width_mm(exif: Exif, sensor_width_px: int | None, aspect: float, war
     return width_mm
 
 
-def _is_about(width_mm: float, other_mm: float) -> bool:
-    return max(width_mm, other_mm) <= SAME_WIDTH * min(width_mm, other_mm)
+def _is_within(most: float, width_mm: float, other_mm: float) -> bool:
+    return max(width_mm, other_mm) <= most * min(width_mm, other_mm)
+
+
+def _is_whole(aspect: float) -> bool:
+    longer = max(aspect, 1 / aspect)
+    return any(math.isclose(longer, known, rel_tol=ASPECT_TOLERANCE) for known in SENSOR_ASPECTS)
 
 
 def _sensor_widths_mm(
@@ -186,8 +194,11 @@ def _sensor_widths_mm(
         else:
             warnings.append(f"its EXIF makes the sensor {width_mm:.3g} mm wide, which cannot be, and was not believed")
     longer = max(aspect, 1 / aspect)
-    is_whole = any(math.isclose(longer, known, rel_tol=ASPECT_TOLERANCE) for known in SENSOR_ASPECTS)
-    shape = () if is_whole else ("the picture is neither 4:3 nor 3:2: the sensor may be larger than the frame it took",)
+    shape = (
+        ()
+        if _is_whole(aspect)
+        else ("the picture is neither 4:3 nor 3:2: the sensor may be larger than the frame it took",)
+    )
     crops: list[tuple[float | None, str]] = [
         (
             _known_crop(exif.make or "", exif.model or ""),

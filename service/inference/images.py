@@ -74,8 +74,6 @@ TURNS: dict[int, tuple[bool, bool, bool]] = {
 UNTURNS = {orientation: {6: 8, 8: 6}.get(orientation, orientation) for orientation in TURNS}
 # not IMREAD_COLOR_RGB: OpenCV 5.0 leaves a 16-bit TIFF read so uninitialised
 DECODE_FLAGS = cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-# an industrial camera's 12 bits, in a file of 16 as they are
-MOST_OF_12_BITS, MOST_OF_16_BITS = 4095, 65535
 LEAST_QUALITY = 60  # of a jpeg, that the model was trained on
 
 
@@ -221,14 +219,21 @@ def _picture(data: bytes, header: Header) -> bytes:
 def _eight_bits(pixels: NDArray[Any]) -> tuple[NDArray[np.uint8], tuple[str, ...]]:
     warnings: tuple[str, ...] = ()
     if pixels.dtype == np.uint16:
-        most = MOST_OF_16_BITS
-        if 0 < pixels.max() <= MOST_OF_12_BITS:
-            most = MOST_OF_12_BITS
-            warnings = (f"nothing in its 16 bits is above {most}: read as 12 bits, and as sRGB",)
+        bits = _bits(int(pixels.max()))
+        most = 2**bits - 1
+        if bits < 16:
+            warnings = (f"nothing in its 16 bits is above {most}: read as {bits} bits, and as sRGB",)
         pixels = cv2.convertScaleAbs(pixels, alpha=255 / most)
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
         raise InvalidImage(f"Pixels of type {pixels.dtype} are not supported: send 8 or 16 bits a channel.")
     return np.asarray(pixels, np.uint8), warnings
+
+
+def _bits(brightest: int) -> int:
+    """How many there are to a pixel, where an industrial camera's 10 or 12 stand in 16 as they are."""
+    if 2**8 <= brightest < 2**10:  # what is darker may be 12 bits of a lens cap
+        return 10
+    return 12 if 0 < brightest < 2**12 else 16
 
 
 def _stored_pixels(decoded: NDArray[np.uint8], header: Header) -> NDArray[np.uint8]:

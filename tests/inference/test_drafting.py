@@ -142,6 +142,21 @@ def test_the_equivalent_tells_the_sensor_but_is_no_focal_length() -> None:
     assert said(alone, "lens.pixel_pitch_um is needed")
 
 
+def test_a_list_that_has_another_lens_of_a_phone_does_not_outweigh_its_exif() -> None:
+    # the list's crop factor of 6 is no sensor of this phone's main lens, whose pixels are 1.8 um wide
+    drafted = draft(
+        *(4000, 3000),
+        make="samsung",
+        model="SM-G991B",
+        focal_length_mm=5.4,
+        focal_length_35mm=26.0,
+        width_px=4000,
+        height_px=3000,
+    )
+    assert drafted.lens.pixel_pitch_um == pytest.approx(1.8, rel=0.01)
+    assert said(drafted, "list of cameras also says 5.77")
+
+
 @pytest.mark.parametrize(
     ("size_px", "focal_length_mm", "is_told"),
     [((4000, 3000), 26.0, True), ((3000, 4000), 26.0, True), ((6000, 4000), 26.0, False), ((4000, 3000), 6.8, False)],

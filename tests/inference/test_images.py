@@ -106,19 +106,21 @@ def test_sixteen_bits_are_scaled_and_not_cut(kind: str) -> None:
     assert np.abs(rgb - deep / 257).max() <= 0.5
 
 
-@pytest.mark.parametrize("kind", [".png", ".tiff"])
-def test_twelve_bits_in_a_file_of_sixteen_are_no_dark_picture(kind: str) -> None:
-    ramp = np.linspace(0, 4095, 48 * 64).round().astype(np.uint16).reshape(48, 64)
+@pytest.mark.parametrize(("kind", "bits"), [(".png", 12), (".tiff", 12), (".png", 10)])
+def test_ten_or_twelve_bits_in_a_file_of_sixteen_are_no_dark_picture(kind: str, bits: int) -> None:
+    most = 2**bits - 1
+    ramp = np.linspace(0, most, 48 * 64).round().astype(np.uint16).reshape(48, 64)
     for pixels in (ramp, np.dstack([ramp] * 3)):
         photograph = read_photograph(encoded(kind, pixels))
-        assert np.abs(photograph.rgb[..., 0] - ramp / 4095 * 255).max() <= 0.51
-        assert [*photograph.warnings] == ["nothing in its 16 bits is above 4095: read as 12 bits, and as sRGB"]
+        assert np.abs(photograph.rgb[..., 0] - ramp / most * 255).max() <= 0.51
+        assert [*photograph.warnings] == [f"nothing in its 16 bits is above {most}: read as {bits} bits, and as sRGB"]
         np.testing.assert_array_equal(read_stored_frame(encoded(kind, pixels)), photograph.rgb)
     brighter = ramp.copy()
     brighter[0, 0] = 4096
     for pixels, brightest in ((brighter, 16), (np.zeros_like(ramp), 0)):
         photograph = read_photograph(encoded(kind, pixels))
         assert (photograph.rgb.max(), photograph.warnings) == (brightest, ())
+    assert read_photograph(encoded(kind, np.full_like(ramp, 255))).rgb.max() == 16  # a lens cap's
 
 
 def test_grey_becomes_rgb_and_alpha_is_dropped() -> None:
