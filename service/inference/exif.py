@@ -12,6 +12,7 @@ MAKE, MODEL = 271, 272
 F_NUMBER, FOCAL_LENGTH, RENDERED, DIGITAL_ZOOM = 0x829D, 0x920A, 0xA401, 0xA404
 SUBJECT_DISTANCE, FOCAL_LENGTH_35MM, LENS_MODEL = 0x9206, 0xA405, 0xA434
 WIDTH, HEIGHT, PLANE_RESOLUTION, PLANE_UNIT = 0xA002, 0xA003, 0xA20E, 0xA210
+THUMBNAIL_START, THUMBNAIL_BYTES = 513, 514
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 MOST_TEXT = 64
 MOST_ZOOM = 1.01  # of what is none
@@ -67,6 +68,16 @@ def read_exif(exif: bytes) -> Exif:
         return body if shot is None else _with_shot(body, shot)
     except (struct.error, InvalidImage):
         return Exif()
+
+
+def thumbnail_in(exif: bytes) -> bytes:
+    """The small JPEG in an EXIF block; empty without one. Raises as ``TiffDirectory`` does."""
+    start = next(TiffDirectory(exif).following(1), None)
+    if start is None:
+        return b""
+    small = TiffDirectory(exif, start)
+    at, size = (next(iter(small.values(tag)), 0) for tag in (THUMBNAIL_START, THUMBNAIL_BYTES))
+    return exif[at : at + size]
 
 
 def _with_shot(body: Exif, shot: TiffDirectory) -> Exif:

@@ -86,6 +86,18 @@ def _stored(value: float | str | tuple[int, int]) -> tuple[int, int, bytes]:
     return (12, 1, struct.pack("<d", value)) if isinstance(value, float) else (5, 1, struct.pack("<II", *value))
 
 
+def exif_with_thumbnail(small: bytes) -> bytes:
+    """A TIFF structure whose second directory is of a small JPEG."""
+    out = bytearray(b"II*\x00\x00\x00\x00\x00")
+    first = _add_directory(out, {271: "Maker"})
+    out[4:8] = struct.pack("<I", first)
+    start = len(out)
+    out += small
+    second = _add_directory(out, {513: start, 514: len(small)})
+    struct.pack_into("<I", out, first + 2 + 12, second)
+    return bytes(out)
+
+
 def with_exif(data: bytes, exif: bytes) -> bytes:
     """A JPEG with an EXIF block."""
     payload = b"Exif\x00\x00" + exif

@@ -1,0 +1,67 @@
+"""Whether a picture was cut out of a larger one, as far as its file tells: by its shape it may seem a small copy."""
+
+import struct
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import CamindError
+from service.inference.exif import thumbnail_in
+from service.inference.headers import Header, read_header
+from service.opencv import cv2
+
+LARGEST_PX, SEEN_PX = 1024, 160  # of a thumbnail's longer side: at the most, and as it is looked at
+SHARES = tuple(float(share) for share in np.geomspace(1, 0.3, 25))  # of a thumbnail's width
+ALL_OF_IT = 0.96
+# correlations: of what is the same place in both, and by how much less the whole must be like it
+ALIKE, CLEARLY = 0.9, 0.1
+ADVICE = "send the whole frame, for a part that is taken for a small copy gives wrong metres"
+
+Grey = NDArray[np.uint8]
+
+
+def signs_of_cutting(header: Header, stored: NDArray[np.uint8]) -> Iterator[str]:
+    """A warning where the stored frame [h, w, 3] RGB is a part of what was taken."""
+    if header.is_cropped:
+        yield f"its XMP says that it was cropped: {ADVICE}"
+        return
+    thumbnail = _thumbnail(header)
+    if thumbnail is not None and _shows_more(thumbnail, stored):
+        yield f"the thumbnail in its EXIF shows more than it does, so it was cropped: {ADVICE}"
+
+
+def _thumbnail(header: Header) -> Grey | None:
+    """The small picture in the EXIF, grey; None without one that can be read."""
+    try:
+        data = thumbnail_in(header.exif) if header.kind not in ("tiff", "raw") else b""
+        small = read_header(data)
+    except (struct.error, CamindError):
+        return None
+    if small.kind != "jpeg" or max(small.width_px, small.height_px) > LARGEST_PX:
+        return None
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        return None
+    return None if pixels is None else np.asarray(pixels, np.uint8)
+
+
+def _made_small(pixels: Grey, scale: float) -> Grey:
+    size = [max(1, round(side * scale)) for side in pixels.shape[1::-1]]
+    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _shows_more(thumbnail: Grey, stored: NDArray[np.uint8]) -> bool:
+    """Whether the picture is found in a part of the thumbnail, and not in all of it but for bars at its sides."""
+    thumbnail = _made_small(thumbnail, min(1.0, SEEN_PX / max(thumbnail.shape)))
+    fit = min(own / whole for own, whole in zip(thumbnail.shape, stored.shape[:2], strict=True))
+    picture = np.asarray(cv2.cvtColor(_made_small(stored, fit), cv2.COLOR_RGB2GRAY), np.uint8)
+    whole = part = -1.0
+    for share in SHARES:
+        found = float(cv2.matchTemplate(thumbnail, _made_small(picture, share), cv2.TM_CCOEFF_NORMED).max())
+        if share >= ALL_OF_IT:
+            whole = max(whole, found)
+        else:
+            part = max(part, found)
+    return part >= ALIKE and part - whole >= CLEARLY

@@ -1,0 +1,73 @@
+"""Pictures that were cut out of larger ones, and all those that were not."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from service.inference.images import read_photograph
+from service.opencv import cv2
+from tests.inference.photographs import encoded, exif_with_thumbnail, jpeg, with_exif
+
+Picture = NDArray[np.uint8]
+
+
+@pytest.fixture(scope="module")
+def whole() -> Picture:
+    noise = np.random.default_rng(0).integers(0, 255, (30, 45, 3), np.uint8)
+    return np.asarray(cv2.resize(noise, (960, 640), interpolation=cv2.INTER_CUBIC), np.uint8)
+
+
+def with_thumbnail(picture: Picture, of: Picture, width_px: int = 160, bar_px: int = 0) -> bytes:
+    """A JPEG whose thumbnail shows another picture, maybe with bars above and below, as cameras write them."""
+    small = cv2.resize(of, (width_px, round(width_px * of.shape[0] / of.shape[1])), interpolation=cv2.INTER_AREA)
+    small = cv2.copyMakeBorder(small, bar_px, bar_px, 0, 0, cv2.BORDER_CONSTANT)
+    thumbnail = encoded(".jpg", np.asarray(small), cv2.IMWRITE_JPEG_QUALITY, 60)
+    return with_exif(jpeg(np.ascontiguousarray(picture)), exif_with_thumbnail(thumbnail))
+
+
+@pytest.mark.parametrize(("width_px", "bar_px"), [(160, 7), (160, 0), (512, 0)])
+def test_a_picture_of_which_the_thumbnail_shows_more_was_cut(whole: Picture, width_px: int, bar_px: int) -> None:
+    for part in (whole[80:560, 120:840], whole[:320, :480], cv2.resize(whole[:480, :720], (960, 640))):
+        (warning,) = read_photograph(with_thumbnail(np.asarray(part), whole, width_px, bar_px)).warnings
+        assert "thumbnail" in warning
+        assert "send the whole frame" in warning
+
+
+def test_a_picture_of_which_it_shows_no_more_is_not_doubted(whole: Picture) -> None:
+    darker = (255 * (whole / 255) ** 1.4).astype(np.uint8)
+    grey = np.full_like(whole, 128)
+    for picture, shown, bar_px in (
+        (whole, whole, 0),
+        (whole, whole, 7),
+        (whole, darker, 7),
+        (whole[::2, ::2], whole, 0),
+        (whole.swapaxes(0, 1), whole, 0),  # turned upright, the thumbnail as it was
+        (whole, whole[:320, :480], 0),
+        (whole, grey, 0),
+        (grey, grey, 0),
+        (grey, whole, 0),
+    ):
+        assert read_photograph(with_thumbnail(picture, shown, bar_px=bar_px)).warnings == ()
+
+
+@pytest.mark.parametrize("data", [b"", b"no jpeg", b"\xff\xd8\xff" + bytes(50), jpeg(np.zeros((1200, 8, 3), np.uint8))])
+def test_what_is_no_thumbnail_is_passed_over(whole: Picture, data: bytes) -> None:
+    assert read_photograph(with_exif(jpeg(whole), exif_with_thumbnail(data))).warnings == ()
+    cut_off = exif_with_thumbnail(jpeg(whole[::8, ::8]))[:-40]
+    assert read_photograph(with_exif(jpeg(whole), cut_off)).warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("said", "is_told"),
+    [
+        (b'crs:HasCrop="True"', True),
+        (b"<crs:HasCrop>True</crs:HasCrop>", True),
+        (b'crs:HasCrop="False"', False),
+        (b"", False),
+    ],
+)
+def test_a_crop_that_an_editor_notes_is_told(whole: Picture, said: bytes, is_told: bool) -> None:
+    data = jpeg(whole)
+    payload = b"http://ns.adobe.com/xap/1.0/\0<rdf:Description " + said + b"/>"
+    data = data[:2] + b"\xff\xe1" + (len(payload) + 2).to_bytes(2, "big") + payload + data[2:]
+    assert any("XMP" in warning for warning in read_photograph(data).warnings) == is_told
