@@ -23,7 +23,6 @@ PNG_READ = frozenset({b"IHDR", b"eXIf", b"acTL", b"cICP", b"iCCP"})
 PNG_ANCILLARY = 0x20  # of a chunk's first letter: no part of the picture (ISO/IEC 15948, 5.4)
 EXIF_SIGNATURE = b"Exif\x00\x00"
 XMP_SIGNATURE = b"http://ns.adobe.com/xap/1.0/\x00"
-CROPPED = re.compile(rb"crs:HasCrop(=['\"]|>)True")  # by Lightroom and Camera Raw
 ICC_SIGNATURE, ICC_NUMBERING = b"ICC_PROFILE\x00", 2
 # of RAF, ORF, RW2, X3F and CR3
 OTHER_RAW = re.compile(rb"FUJIFILMCCD-RAW|IIR[OS]|MMOR|IIU\0|FOVb|....ftypcrx ", re.DOTALL)
@@ -63,7 +62,7 @@ class Header:
     """Stored size in pixels, before orientation (EXIF, 1..8) is applied; ``exif`` is the EXIF, without a signature.
 
     Of a tiff or raw file that is the file. ``has_more``: other pages or frames follow. ``curve``: what its values have,
-    by H.273's number. ``quality``: of a jpeg, 1 to 100, as most programs count it. ``is_cropped``: its XMP says so.
+    by H.273's number. ``quality``: of a jpeg, 1 to 100, as most programs count it. ``xmp``: of a jpeg.
     """
 
     kind: Kind
@@ -75,7 +74,7 @@ class Header:
     has_more: bool = False
     curve: int = SRGB
     quality: float | None = None
-    is_cropped: bool = False
+    xmp: bytes = b""
 
     @property
     def other_curve(self) -> str | None:
@@ -122,9 +121,9 @@ def _too_many_parts(kind: str) -> InvalidImage:
 
 def _jpeg(data: bytes) -> Header:
     size: tuple[int, int] | None = None
-    exif = profile = b""
+    exif = profile = xmp = b""
     quality: float | None = None
-    is_cropped, scans = False, 0
+    scans = 0
     for marker, payload in _jpeg_segments(data):
         scans += marker == JPEG_SCAN
         if scans > MOST_SCANS:
@@ -135,7 +134,7 @@ def _jpeg(data: bytes) -> Header:
         elif marker == JPEG_APP1 and payload.startswith(EXIF_SIGNATURE):
             exif = payload[len(EXIF_SIGNATURE) :]
         elif marker == JPEG_APP1 and payload.startswith(XMP_SIGNATURE):
-            is_cropped = CROPPED.search(payload) is not None
+            xmp = payload
         elif marker == JPEG_APP2 and payload.startswith(ICC_SIGNATURE):
             profile = profile or payload[len(ICC_SIGNATURE) + ICC_NUMBERING :]
         elif marker == JPEG_STEPS and quality is None:
@@ -143,9 +142,7 @@ def _jpeg(data: bytes) -> Header:
     if size is None:
         raise InvalidImage("The jpeg file holds no picture.")
     curve = curve_of_profile(profile)
-    return Header(
-        "jpeg", *size, _exif_orientation(exif), exif=exif, curve=curve, quality=quality, is_cropped=is_cropped
-    )
+    return Header("jpeg", *size, _exif_orientation(exif), exif=exif, curve=curve, quality=quality, xmp=xmp)
 
 
 def _jpeg_quality(tables: bytes) -> float:

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from service import PIXEL_CEILING
 from service.config import Settings
 from service.errors import InvalidImage, TooLarge, UnsupportedKind
-from service.inference.cut import signs_of_cutting
 from service.inference.exif import Exif, read_exif
 from service.inference.headers import Header, Kind, picture_of_png, read_header
 from service.inference.isolated import decode_isolated
+from service.inference.making import signs_of_making
 from service.opencv import cv2
 
 MEDIA_TYPES: dict[str, Kind] = {
@@ -134,7 +134,7 @@ def read_photograph(data: bytes, media_type: str | None = None, limits: ImageLim
     if header.quality is not None and round(header.quality) < LEAST_QUALITY:
         said = f"a jpeg of quality {header.quality:.0f}, below the {LEAST_QUALITY} that the model was trained on"
         warnings += (f"{said}: send what the camera stored",)
-    warnings += tuple(signs_of_cutting(header, stored))
+    warnings += tuple(signs_of_making(header, stored))
     return Photograph(turned(stored, orientation), kind, orientation, warnings, read_exif(header.exif))
 
 

@@ -1,5 +1,9 @@
-"""Whether a picture was cut out of a larger one, as far as its file tells: by its shape it may seem a small copy."""
+"""Whether a picture is what a lens showed: by its shape a part may seem a small copy, and a phone may compute blur.
 
+What the XMP says is looked for in its text, which no parser of XML has to be trusted with.
+"""
+
+import re
 import struct
 from collections.abc import Iterator
 
@@ -16,14 +20,21 @@ SHARES = tuple(float(share) for share in np.geomspace(1, 0.3, 25))  # of a thumb
 ALL_OF_IT = 0.96
 # correlations: of what is the same place in both, and by how much less the whole must be like it
 ALIKE, CLEARLY = 0.9, 0.1
+# by Lightroom and Camera Raw; what they have yet to do to the pixels they note as well
+CROPPED, APPLIED = (re.compile(rb"crs:" + name + rb"(=[\'\"]|>)True", re.I) for name in (b"HasCrop", b"AlreadyApplied"))
+# of Google's cameras, and of others as theirs do
+RENDERINGS = {b"GPano:ProjectionType": "a panorama", b"SpecialType-PORTRAIT": "a portrait mode"}
 ADVICE = "send the whole frame, for a part that is taken for a small copy gives wrong metres"
 
 Grey = NDArray[np.uint8]
 
 
-def signs_of_cutting(header: Header, stored: NDArray[np.uint8]) -> Iterator[str]:
-    """A warning where the stored frame [h, w, 3] RGB is a part of what was taken."""
-    if header.is_cropped:
+def signs_of_making(header: Header, stored: NDArray[np.uint8]) -> Iterator[str]:
+    """Warnings where the stored frame [h, w, 3] RGB is a part of what was taken, or was computed."""
+    for mark, rendering in RENDERINGS.items():
+        if mark in header.xmp:
+            yield f"its XMP says {rendering}: its blur may be computed, and no lens'"
+    if CROPPED.search(header.xmp) and APPLIED.search(header.xmp):
         yield f"its XMP says that it was cropped: {ADVICE}"
         return
     thumbnail = _thumbnail(header)

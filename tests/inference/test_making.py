@@ -1,4 +1,4 @@
-"""Pictures that were cut out of larger ones, and all those that were not."""
+"""Pictures that were cut out of larger ones or computed, and all those that were not."""
 
 import numpy as np
 import pytest
@@ -58,16 +58,21 @@ def test_what_is_no_thumbnail_is_passed_over(whole: Picture, data: bytes) -> Non
 
 
 @pytest.mark.parametrize(
-    ("said", "is_told"),
+    ("said", "word"),
     [
-        (b'crs:HasCrop="True"', True),
-        (b"<crs:HasCrop>True</crs:HasCrop>", True),
-        (b'crs:HasCrop="False"', False),
-        (b"", False),
+        (b'crs:HasCrop="True" crs:AlreadyApplied="True"', "cropped"),
+        (b"<crs:HasCrop>True</crs:HasCrop><crs:AlreadyApplied>True</crs:AlreadyApplied>", "cropped"),
+        (b'crs:HasCrop="True" crs:AlreadyApplied="False"', ""),
+        (b'crs:HasCrop="False" crs:AlreadyApplied="True"', ""),
+        (b'GPano:ProjectionType="cylindrical"', "panorama"),
+        (b"<rdf:li>com.google.android.apps.camera.gallery.specialtype.SpecialType-PORTRAIT</rdf:li>", "portrait"),
+        (b"", ""),
     ],
 )
-def test_a_crop_that_an_editor_notes_is_told(whole: Picture, said: bytes, is_told: bool) -> None:
+def test_what_an_editor_or_a_phone_notes_is_told(whole: Picture, said: bytes, word: str) -> None:
     data = jpeg(whole)
     payload = b"http://ns.adobe.com/xap/1.0/\0<rdf:Description " + said + b"/>"
     data = data[:2] + b"\xff\xe1" + (len(payload) + 2).to_bytes(2, "big") + payload + data[2:]
-    assert any("XMP" in warning for warning in read_photograph(data).warnings) == is_told
+    warnings = read_photograph(data).warnings
+    assert bool(warnings) == bool(word)
+    assert all(warning.startswith("its XMP says") and word in warning for warning in warnings)
