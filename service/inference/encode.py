@@ -249,9 +249,10 @@ def _rays(answer: DepthMap, u: NDArray[np.intp], v: NDArray[np.intp]) -> NDArray
     corners = _grid_rays(answer, down, across).astype(np.float32)
     to_corners = np.array([[1 / RAY_CELL_PX, 0, 0], [0, 1 / RAY_CELL_PX, 0]])
     linear = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    rays = np.stack([cv2.warpAffine(values, to_corners, (width, height), flags=linear)[v, u] for values in corners])
-    between = (corners[:, :-1, :-1] + corners[:, :-1, 1:] + corners[:, 1:, :-1] + corners[:, 1:, 1:]) / 4
-    off = _grid_rays(answer, down[:-1] + RAY_CELL_PX / 2, across[:-1] + RAY_CELL_PX / 2) - between
+    between_corners = (cv2.warpAffine(values, to_corners, (width, height), flags=linear) for values in corners)
+    rays = np.array([values[v, u] for values in between_corners], np.float64)
+    middles = (corners[:, :-1, :-1] + corners[:, :-1, 1:] + corners[:, 1:, :-1] + corners[:, 1:, 1:]) / 4
+    off = _grid_rays(answer, down[:-1] + RAY_CELL_PX / 2, across[:-1] + RAY_CELL_PX / 2) - middles
     is_bent = ~(np.hypot(*off) * matrix[0, 0] <= MOST_BENT_PX)
     if is_bent.any():
         alone = is_bent[v // RAY_CELL_PX, u // RAY_CELL_PX]
