@@ -23,6 +23,13 @@ Learning = Literal["all", "depth", "layout"]
 Part = Literal["blur", "depth", "depth.layout"]
 
 
+def first_error(exc: ValidationError) -> str:
+    """Where the first of the errors is, and what is wrong there."""
+    wrong = exc.errors(include_url=False)[0]
+    place = ".".join(map(str, wrong["loc"]))
+    return f"{place}: {wrong['msg']}" if place else wrong["msg"]
+
+
 @dataclass(frozen=True, slots=True)
 class SceneConfig:
     """What the procedural scenes span, in ranges (low, high) that the manifest states, and what they are mixed of.
@@ -153,8 +160,7 @@ class TrainConfig:
         try:
             told = TypeAdapter(TrainConfig).validate_python(values)
         except ValidationError as exc:
-            wrong = exc.errors(include_url=False)[0]
-            raise ValueError(f"{'.'.join(map(str, wrong['loc']))}: {wrong['msg']}") from exc
+            raise ValueError(first_error(exc)) from exc
         for name, span in asdict(told.scenes).items():
             if isinstance(span, tuple) and span[0] > span[1]:
                 raise ValueError(f"scenes.{name}: the first of {list(span)} is to be the lower one")

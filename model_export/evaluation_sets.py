@@ -1,7 +1,6 @@
 """What a model is scored on: pictures with a camera and the truth, made from the development data or drawn."""
 
 import itertools
-import json
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_export.config import SceneConfig
-from model_export.datasets.photos import CAMERAS, Photo, filled, load_photos
+from model_export.datasets.photos import CAMERAS, CameraPart, Photo, filled, load_cameras, load_photos, pictures_of
 from model_export.modes import (
     ESTIMATED_K_CAM,
     KNOWN_DEPTHS,
@@ -55,7 +54,7 @@ FIXED = "fixed"
 FOLDERS = ("rgbd", "tabletop", "d200", "blender")  # a set of each, or several
 FIXED_SCENES = 6
 TAKEN_NAMES = (FIXED, "plane", "procedural", "indoor")  # what names of sets that are no folder begin with
-CAMERA_NAMES = ("focus_distance_m", "k_cam_px", "gamma_px")  # without which no picture can be answered
+NEEDED: tuple[CameraPart, ...] = ("focus_distance_m", "k_cam_px", "gamma_px")  # to answer a picture
 ORACLE_FACTORS = (0.8, 0.9, 1.0, 1.1, 1.25, 1.4)
 KNOWN_RANKS = (1 / 6, 3 / 6, 5 / 6)
 PROCEDURAL_SIDES = {"near": -1, "far": 1, "mixed": 0}
@@ -235,7 +234,7 @@ def fixed_cases() -> Iterator[Case]:
 
 def photographed_cases(folder: Path, count: int) -> Iterator[Case]:
     """Pictures out of focus, each with a camera in ``cameras.json``, as of ``camind blender``; the side is not told."""
-    cameras = _cameras(folder)
+    cameras = load_cameras(folder, NEEDED)
     for photo in _spread(folder, count):
         height, width = photo.image.shape[:2]
         told = cameras[photo.name]
@@ -245,24 +244,9 @@ def photographed_cases(folder: Path, count: int) -> Iterator[Case]:
         yield Case(photo.name, photo.image, photo.depth_m, camera, "auto", blur_px)
 
 
-def _cameras(folder: Path) -> dict[str, dict[str, float]]:
-    """What took each picture of a folder, by its stem; ``ValueError`` where that is not said."""
-    cameras: dict[str, dict[str, float]] = json.loads((folder / CAMERAS).read_text())
-    if not isinstance(cameras, dict):
-        raise ValueError(f"{folder / CAMERAS} must be a JSON object of cameras by their pictures' names")
-    for name in sorted(file.stem for file in (folder / "color").glob("*")):
-        if lacking := [wanted for wanted in CAMERA_NAMES if wanted not in cameras.get(name, {})]:
-            raise ValueError(
-                f"{folder / CAMERAS} has no {lacking[0]} of {name}, which {folder / 'color'} has "
-                f"(sharp frames, as NYU's, are scored in {folder.with_name('rgbd')})"
-            )
-    return cameras
-
-
 def _spread(folder: Path, count: int) -> Iterator[Photo]:
     """About ``count`` of a folder's photos, spread over it."""
-    total = len(list((folder / "color").glob("*")))
-    return load_photos(folder, max(1, math.ceil(total / count)))
+    return load_photos(folder, max(1, math.ceil(len(pictures_of(folder)) / count)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,9 +275,12 @@ def _enough(source: CaseSource) -> Iterator[Case]:
 
 
 def evaluation_sets(data: Path, quick: bool) -> list[EvaluationSet]:
-    """The sets that the data folder can serve; a folder that is missing, or has no pictures, is a missing set."""
+    """The sets that the data folder can serve; a folder that is missing, or has no pictures, is a missing set.
+
+    Raises ``ValueError`` or ``OSError`` for what is wrong with a set of one's own.
+    """
     few, _, many, scenes = COUNTS[quick]
-    there = {name: data / name for name in FOLDERS if any((data / name / "color").glob("*"))}
+    there = {name: data / name for name in FOLDERS if pictures_of(data / name)}
     indoor = [there[name] for name in ("rgbd", "tabletop") if name in there]
     found = []
     if len(indoor) == 2:
@@ -303,7 +290,10 @@ def evaluation_sets(data: Path, quick: bool) -> list[EvaluationSet]:
     if "blender" in there:
         found.append(_set("blender", partial(photographed_cases, there["blender"], 2 * scenes), RIGHT_SIDE))
     for folder in photographed_folders(data):
-        found.append(_set(folder.name, partial(photographed_cases, folder, 2 * scenes), RIGHT_SIDE))
+        own = partial(photographed_cases, folder, 2 * scenes)
+        for _ in own():  # what is wrong with one of them is said before anything is scored
+            pass
+        found.append(_set(folder.name, own, RIGHT_SIDE))
     for folder in indoor:
         found += _indoor_sets(folder, quick)
     if "d200" in there:
@@ -315,15 +305,16 @@ def evaluation_sets(data: Path, quick: bool) -> list[EvaluationSet]:
 
 
 def photographed_folders(data: Path) -> list[Path]:
-    """Those of a data folder that have a name of their own and cameras of their pictures.
+    """Those of a data folder that have pictures, or cameras of pictures, and a name of their own.
 
-    Raises ``ValueError`` for the name of another set, or a picture whose camera is not told.
+    Raises ``ValueError`` for the name of another set, and for a folder that is itself a set.
     """
-    folders = sorted(file.parent for file in data.glob(f"*/{CAMERAS}") if file.parent.name not in FOLDERS)
+    if (data / "color").is_dir():
+        raise ValueError(f"{data} is a set of pictures itself: name the folder that it is in")
+    parts = (part for name in ("color", CAMERAS) for part in data.glob(f"*/{name}"))
+    folders = sorted({part.parent for part in parts if part.parent.name not in FOLDERS})
     if taken := [folder for folder in folders if folder.name in TAKEN_NAMES or " " in folder.name]:
         raise ValueError(f"{taken[0]} has the name of another set, or a space in it: name it otherwise")
-    for folder in folders:
-        _cameras(folder)
     return folders
 
 

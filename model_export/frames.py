@@ -1,6 +1,5 @@
 """Sharp pictures with depth (``camind homes``), to be photographed by cameras that training draws."""
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from model_export.datasets.photos import CAMERAS, filled, load_photos
+from model_export.datasets.photos import filled, load_cameras, load_photos
 from service.optics import thin_lens
 from service.optics.light import decode_srgb
 
@@ -39,13 +38,10 @@ class Frame:
 
 def load_frames(folder: Path) -> list[Frame]:
     """All frames of a folder with ``color/``, ``depth/`` and ``cameras.json``. Raises if there is none."""
-    file = folder / CAMERAS
-    cameras = json.loads(file.read_text())
-    photos = list(load_photos(folder))
-    if unknown := [photo.name for photo in photos if photo.name not in cameras]:
-        raise ValueError(f"{file} has no {unknown[0]}, which {folder / 'color'} has")
+    cameras = load_cameras(folder, ("fx_px",))
     return [
-        Frame(photo.image, filled(photo.depth_m).astype(np.float16), cameras[photo.name]["fx_px"]) for photo in photos
+        Frame(photo.image, filled(photo.depth_m).astype(np.float16), cameras[photo.name]["fx_px"])
+        for photo in load_photos(folder)
     ]
 
 

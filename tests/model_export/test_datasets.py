@@ -16,6 +16,7 @@ from model_export.evaluation_sets import REFERENCE, evaluation_sets, photographe
 from service.optics import thin_lens
 
 PICTURE = np.random.default_rng(1).integers(0, 256, (48, 64, 3), np.uint8)
+OWN_CAMERA = {"focus_distance_m": 2.0, "k_cam_px": 3.0, "gamma_px": 0.5}
 
 
 def converted(layout: str, source: Path, out: Path) -> str:
@@ -91,14 +92,49 @@ def test_files_of_another_layout_are_refused_in_a_line(tmp_path: Path, layout: s
 
 def test_own_photographs_are_scored_by_their_cameras(tmp_path: Path) -> None:
     depth_m = np.full((48, 64), 1.5, np.float32)
-    camera = {"focus_distance_m": 2.0, "k_cam_px": 3.0, "gamma_px": 0.5}
-    save_photos(tmp_path / "desk", [(Photo("a", PICTURE, depth_m), camera)])
+    save_photos(tmp_path / "desk", [(Photo("a", PICTURE, depth_m), OWN_CAMERA)])
     (case,) = photographed_cases(tmp_path / "desk", 1)
     assert case.side == "auto"
     assert case.camera.intrinsics is None
-    (tmp_path / "desk" / "cameras.json").write_text(json.dumps({"a": {"k_cam_px": 3.0}}))
-    with pytest.raises(ValueError, match="no focus_distance_m of a"):
-        list(photographed_cases(tmp_path / "desk", 1))
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "said"),
+    [
+        ("cameras.json", '{"a": {"k_cam_px": 3.0}}', "no focus_distance_m of a"),
+        ("cameras.json", '{"a": {"k_cam_px"', r"cameras.json: Invalid JSON"),
+        ("cameras.json", '{"a": null}', r"cameras.json: a: Input should be a valid dictionary"),
+        ("cameras.json", '{"a.png": {}}', r"cameras.json has no a, which is .*a.png"),
+        ("cameras.json", json.dumps({"a": OWN_CAMERA | {"fx": 900}}), "a: fx.* 'gamma_px' or 'fx_px'"),
+        ("cameras.json", json.dumps({"a": OWN_CAMERA | {"k_cam_px": "3"}}), "a: k_cam_px: .*valid number"),
+        ("cameras.json", json.dumps({"a": OWN_CAMERA | {"gamma_px": -1}}), "a: gamma_px: .*greater than 0"),
+        ("cameras.json", None, "desk has no cameras.json"),
+        ("depth/a.png", None, "depth/a.png is missing"),
+        ("depth/a.png", "", "depth/a.png is no depth: a grey PNG of 16 bits"),
+        ("color/a.jpg", "", "two pictures of the name a"),
+        ("color/b.png", "", "cameras.json has no b"),
+        ("color/a.png", None, "no pictures in"),
+        ("../color/a.png", "", "is a set of pictures itself"),
+    ],
+)
+def test_a_mistake_in_a_set_is_named_before_anything_is_scored(
+    tmp_path: Path, file: str, content: str | None, said: str
+) -> None:
+    save_photos(tmp_path / "desk", [(Photo("a", PICTURE, np.ones((48, 64), np.float32)), OWN_CAMERA)])
+    wrong = tmp_path / "desk" / file
+    wrong.parent.mkdir(exist_ok=True)
+    if content is None:
+        wrong.unlink()
+    else:
+        wrong.write_text(content)
+    with pytest.raises((ValueError, FileNotFoundError), match=said):
+        evaluation_sets(tmp_path, quick=True)
+
+
+def test_what_a_file_manager_hides_among_pictures_is_none(tmp_path: Path) -> None:
+    save_photos(tmp_path / "desk", [(Photo("a", PICTURE, np.ones((48, 64), np.float32)), OWN_CAMERA)])
+    (tmp_path / "desk" / "color" / ".DS_Store").write_bytes(b"no picture")
+    assert [case.name for case in photographed_cases(tmp_path / "desk", 1)] == ["a"]
 
 
 def test_sharp_frames_under_a_name_of_their_own_are_refused_before_anything_is_scored(tmp_path: Path) -> None:
