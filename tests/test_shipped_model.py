@@ -2,6 +2,9 @@
 
 import io
 import json
+import re
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -54,6 +57,23 @@ def test_the_folder_is_whole_small_and_says_where_it_comes_from() -> None:
     assert "LICENCE" in folder.card().upper()
     assert folder.manifest.scores
     assert folder.manifest.ranges.k_cam_px.low == SceneConfig().k_cam_px[0]
+
+
+def test_a_robots_client_is_answered_as_its_page_says(server: Server, tmp_path: Path) -> None:
+    frame = cv2.imread(str(PICTURE))
+    assert frame is not None
+    size = (frame.shape[1], frame.shape[0])
+    video = cv2.VideoWriter(str(tmp_path / "frames.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, size)
+    video.write(frame)
+    video.release()
+    page = (PICTURE.parents[1] / "robots.md").read_text()
+    client = tmp_path / "frames.py"
+    client.write_text(page.split("```python\n")[1].split("```")[0].replace("DEADLINE_S = 1.0", "DEADLINE_S = 60.0"))
+    command = [sys.executable, client, server.url.rstrip("/"), "d200", tmp_path / "frames.avi"]
+    answered = subprocess.run(command, capture_output=True, text=True, check=True)
+    said = r"\d+\.\d{6}: \d+\.\d\d s old, \d+% of \(432, 64[45]\) sure, fx 96\d\.\d px\n"
+    assert re.fullmatch(said, answered.stdout)
+    assert not answered.stderr
 
 
 def test_the_readmes_picture_becomes_a_16_bit_map_of_its_size(server: Server) -> None:
