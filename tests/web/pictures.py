@@ -126,8 +126,6 @@ PICTURES = (
     Picture("calibrate.jpg", "calibrate", photographs, height_px=1200),
     Picture("calibration.jpg", "calibrate", calibration, height_px=1200),
     Picture("status.png", "status", status),
-    Picture("status-dark.png", "status", status, scheme="dark"),
-    Picture("status-narrow.png", "status", status, width_px=360, height_px=720),
 )
 
 

@@ -99,3 +99,6 @@ def test_the_pictures_of_the_page_are_there_and_small() -> None:
     sizes = {path.name: path.stat().st_size for path in pictures.IMAGES.iterdir()}
     assert set(sizes) == {picture.name for picture in pictures.PICTURES}, "run `make pictures`"
     assert max(sizes.values()) < pictures.MOST_BYTES
+    pages = [pictures.ROOT / "README.md", *(pictures.ROOT / "docs").glob("*.md")]
+    text = "".join(page.read_text(encoding="utf-8") for page in pages)
+    assert [name for name in sizes if f"images/{name}" not in text] == []
