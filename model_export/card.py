@@ -3,25 +3,35 @@
 from collections.abc import Mapping
 from pathlib import Path
 
+from model_export.config import Kind
 from service.inference.artifact import Interval, Ranges, Training, load_model_folder, sha256_of, write_manifest
 
 SOURCES_LEAD = "Pictures that scenes were made of:"
 SCORES_HEADING = "## Scores"
+GRAPHS = "Two graphs: `blur.onnx` reads blur, `depth.onnx` turns camera-corrected blur into depth"
+OF_GRAPHS: dict[Kind, str] = {
+    "compact": """; a part of the second is
+`layout.onnx` too, for photographs of more than 640 px.""",
+    "paper": ".\nThey are the U-Nets of the paper.",
+}
+OF_PIXELS: dict[Kind, str] = {
+    "compact": """an error (`sigma_m`) and a second hypothesis on the other side of focus. Flat, textureless areas carry
+no blur to read; there the surroundings are continued and the stated error is large.""",
+    "paper": "one depth, on whichever side of focus; its error (`sigma_m`) is not learned.",
+}
 
 
-def card_text(name: str, ranges: Ranges, training: Training, parameters: int, sources: str) -> str:
+def card_text(name: str, kind: Kind, ranges: Ranges, training: Training, parameters: int, sources: str) -> str:
     """Markdown of a model that was not evaluated yet."""
     return f"""# {name}
 
 Depth in metres from the defocus blur of one photograph, for any camera whose k_cam and gamma are known.
-Two graphs: `blur.onnx` reads blur, `depth.onnx` turns camera-corrected blur into depth; a part of the second is
-`layout.onnx` too, for photographs of more than 640 px. {parameters:,} parameters.
+{GRAPHS}{OF_GRAPHS[kind]} {parameters:,} parameters.
 
 ## Use
 
 For static measurements in the range where blur tells distance: a camera's `range_m` says up to where. Every
-pixel has an error (`sigma_m`) and a second hypothesis on the other side of focus. Flat, textureless areas carry
-no blur to read; there the surroundings are continued and the stated error is large. Not for safety functions.
+pixel has {OF_PIXELS[kind]} Not for safety functions.
 
 ## Trained on
 

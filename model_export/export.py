@@ -245,7 +245,7 @@ def export_pair(
     graphs = write_graphs(pair, folder)
     ranges = trained_ranges(config.scenes)
     training = Training(commit=source_commit(), steps=steps, config=config.as_dict())
-    (folder / CARD).write_text(card_text(name, ranges, training, parameter_count(pair), sources))
+    (folder / CARD).write_text(card_text(name, pair.kind, ranges, training, parameter_count(pair), sources))
     manifest = Manifest(
         name=name,
         kind=pair.kind,

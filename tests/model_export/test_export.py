@@ -164,6 +164,7 @@ def test_graphs_name_no_file_of_the_machine_that_made_them(
 def test_the_card_carries_ranges_licences_and_then_scores(exported: tuple[Pair, Path]) -> None:
     folder = exported[1]
     assert "- brick: CC0" in load_model_folder(folder).card()
+    assert ("layout.onnx" in load_model_folder(folder).card()) == (folder / "layout.onnx").is_file()
     record_scores(folder, {"plane.abs_rel": 0.05}, {"Depth": "| a |"}, "camind evaluate")
     after = load_model_folder(folder)
     assert after.manifest.scores == {"plane.abs_rel": 0.05}
