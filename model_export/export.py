@@ -213,17 +213,19 @@ def trained_ranges(scenes: SceneConfig) -> Ranges:
     )
 
 
-def source_commit() -> str:
-    """The commit of the training code, with ``+`` where the tree differs from it; ``unknown`` outside git."""
-    here = Path(__file__).parent
+def source_commit(folder: Path = Path(__file__).parent) -> str:
+    """The commit of the training code, with ``+`` where the tree differs from it; ``unknown`` outside its own git."""
+
+    def git(*arguments: str) -> str:
+        done = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
     try:
-        head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=True)
-        change = subprocess.run(
-            ["git", "status", "--porcelain", "--", "."], cwd=here, capture_output=True, text=True, check=True
-        )
+        # what is installed may lie in a checkout of something else, whose commit would say nothing of it
+        git("ls-files", "--error-unmatch", "--", Path(__file__).name)
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--", ".") else "")
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
-    return head.stdout.strip() + ("+" if change.stdout.strip() else "")
 
 
 def export_pair(

@@ -1,5 +1,6 @@
 """Export: the files answer as torch does, and the folder vouches for them."""
 
+import subprocess
 from functools import partial
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from model_export import quantized
 from model_export.card import record_scores
 from model_export.config import Kind, SceneConfig, TrainConfig
-from model_export.export import export_pair
+from model_export.export import export_pair, source_commit
 from model_export.networks import CompactDepth, Pair, make_pair
 from model_export.scenes import draw_sample
 from model_export.verify import SIZES, TOLERANCE, verify_pair
@@ -170,3 +171,21 @@ def test_the_card_carries_ranges_licences_and_then_scores(exported: tuple[Pair, 
     assert after.manifest.scores == {"plane.abs_rel": 0.05}
     assert "| a |" in after.card()
     assert "Not evaluated" not in after.card()
+
+
+def test_a_commit_is_named_only_where_the_code_is_in_it(tmp_path: Path) -> None:
+    def git(*arguments: str) -> None:
+        author = ("-c", "user.name=x", "-c", "user.email=x@example.org", "-c", "commit.gpgsign=false")
+        subprocess.run(["git", *author, *arguments], cwd=tmp_path, check=True, capture_output=True)
+
+    assert source_commit(tmp_path) == "unknown"
+    git("init")
+    git("commit", "--allow-empty", "--message", "another's")
+    (tmp_path / "export.py").touch()
+    assert source_commit(tmp_path) == "unknown"
+    git("add", ".")
+    git("commit", "--message", "ours")
+    commit = source_commit(tmp_path)
+    assert len(commit) == 40
+    (tmp_path / "export.py").write_text("changed")
+    assert source_commit(tmp_path) == f"{commit}+"
