@@ -3,7 +3,7 @@
 from alembic import context
 from sqlalchemy import Connection
 
-from service.config import load_settings
+from service.config import load_storage_settings
 from service.storage.engine import open_engine, unhurried
 from service.storage.tables import metadata
 
@@ -26,7 +26,7 @@ def main() -> None:
     if isinstance(given, Connection):
         run(given)
         return
-    with open_engine(load_settings().effective_database_url).connect() as connection, unhurried(connection):
+    with open_engine(load_storage_settings().effective_database_url).connect() as connection, unhurried(connection):
         run(connection)
 
 

@@ -15,7 +15,14 @@ import typer
 from sqlalchemy import Engine
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.config import DATABASE_FILE, Settings, SettingsError, load_settings
+from service.config import (
+    DATABASE_FILE,
+    Settings,
+    SettingsError,
+    StorageSettings,
+    load_settings,
+    load_storage_settings,
+)
 from service.errors import BadRequest, CamindError, Conflict, NotFound
 from service.memory import end_uncollected, lasting
 from service.optics.camera import FOCUS_DISTANCES_M
@@ -105,7 +112,7 @@ def migrate() -> None:
     """Bring the database to the newest schema."""
     from service.storage import schema
 
-    with _plain_failures(), _opened(_settings(), is_migrated=True) as engine:
+    with _plain_failures(), _opened(_storage(), is_migrated=True) as engine:
         typer.echo(f"The database is at {schema.current_revision(engine)}.")
 
 
@@ -121,7 +128,7 @@ def back_up(
     from service.storage.backup import backup
 
     _end_in_order()
-    database = _database_file(_settings())
+    database = _database_file(_storage())
     with _plain_failures():
         contents = backup(database, file, is_forced=force)
     typer.echo(f"{file} holds {contents}")
@@ -142,7 +149,7 @@ def restore(
     from service.storage.spool import known_id
 
     _end_in_order()
-    settings = _settings()
+    settings = _storage()
     database = database_file(settings.effective_database_url)
     with _plain_failures():
         if database is None:
@@ -154,7 +161,7 @@ def restore(
         typer.echo(f"What was there before is {kept}")
 
 
-def _move(file: Path, settings: Settings) -> None:
+def _move(file: Path, settings: StorageSettings) -> None:
     from service.storage.move import move
     from service.storage.spool import known_id
 
@@ -529,8 +536,20 @@ def _drop_unwritten() -> None:
 
 
 def _settings(**overrides: object) -> Settings:
-    try:
+    with _settings_said():
         return load_settings(**overrides)
+
+
+def _storage() -> StorageSettings:
+    """Where the data are: how they are served is no matter of a command on them."""
+    with _settings_said():
+        return load_storage_settings()
+
+
+@contextmanager
+def _settings_said() -> Iterator[None]:
+    try:
+        yield
     except SettingsError as exc:
         raise _failure(str(exc), WRONG_USE) from exc
 
@@ -547,7 +566,7 @@ def _require_key(settings: Settings, engine: Engine) -> None:
 
 
 @contextmanager
-def _opened(settings: Settings, *, is_migrated: bool = False) -> Iterator[Engine]:
+def _opened(settings: StorageSettings, *, is_migrated: bool = False) -> Iterator[Engine]:
     """The configured database, which nobody restores meanwhile; one that others share is migrated only where asked."""
     from service.storage import schema
     from service.storage.backup import using
@@ -568,7 +587,7 @@ def _ready_engine() -> Iterator[Engine]:
     """The configured database, at the newest schema."""
     from service.storage import schema
 
-    with _opened(_settings()) as engine:
+    with _opened(_storage()) as engine:
         schema.require_head(engine)
         yield engine
 
@@ -586,7 +605,7 @@ def _require_storable(name: str) -> None:
         require_writable(engine)
 
 
-def _require_sound(settings: Settings) -> None:
+def _require_sound(settings: StorageSettings) -> None:
     from service.storage.backup import database_file, require_sound, using
 
     database = database_file(settings.effective_database_url)
@@ -595,7 +614,7 @@ def _require_sound(settings: Settings) -> None:
             require_sound(database)
 
 
-def _database_file(settings: Settings) -> Path:
+def _database_file(settings: StorageSettings) -> Path:
     """The file of the configured database; PostgreSQL has commands of its own for it."""
     from service.storage.backup import database_file
 

@@ -6,7 +6,7 @@ Nothing else reads the environment, and nothing is read at import. A value out o
 import os
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -38,6 +38,7 @@ def _listed(text: str) -> frozenset[str]:
 
 
 Folder = Annotated[Path, AfterValidator(_expanded)]
+Kind = TypeVar("Kind", bound="StorageSettings")
 
 
 def default_data_dir() -> Path:
@@ -50,8 +51,8 @@ def default_otlp_endpoint() -> str:
     return os.environ.get("OTEL_EXPORTER_OTLP_ENDPOINT", "")
 
 
-class Settings(BaseSettings):
-    """Everything an operator can choose. Durations in seconds, sizes in bytes, images in pixels."""
+class StorageSettings(BaseSettings):
+    """Where the database and the service's files are: all that a command on them needs."""
 
     model_config = SettingsConfigDict(env_prefix=ENV_PREFIX, frozen=True, extra="forbid", env_ignore_empty=True)
 
@@ -61,6 +62,46 @@ class Settings(BaseSettings):
     database_url: Annotated[
         str, Field(description="SQLite or PostgreSQL (postgresql+psycopg://); empty: a file in data_dir")
     ] = ""
+
+    @model_validator(mode="after")
+    def _check_database(self) -> Self:
+        scheme = self.database_url.partition(":")[0]
+        if self.database_url and scheme not in DATABASE_SCHEMES:
+            raise ValueError(f"{ENV_PREFIX}DATABASE_URL must begin with one of {', '.join(DATABASE_SCHEMES)}")
+        try:
+            url = self.effective_database_url
+            url.get_dialect()().create_connect_args(url)
+        except (ArgumentError, ValueError) as exc:
+            # what was read wrongly may be a part of the password
+            raise ValueError(
+                f"{ENV_PREFIX}DATABASE_URL cannot be read: write sqlite:////folder/file or "
+                "postgresql+psycopg://user:password@host:port/name, other signs than letters and digits as %XX"
+            ) from exc
+        if self.is_database_embedded and (url.database in (None, "", ":memory:") or "uri" in url.query):
+            raise ValueError(f"{ENV_PREFIX}DATABASE_URL names no file: write sqlite:////folder/file")
+        return self
+
+    @property
+    def effective_database_url(self) -> URL:
+        """The database's URL, the default file in the data folder filled in."""
+        if self.database_url:
+            return make_url(self.database_url)
+        return URL.create("sqlite", database=str(self.data_dir.resolve() / DATABASE_FILE))
+
+    @property
+    def spool_dir(self) -> Path:
+        """Where photographs lie until their calibration ends."""
+        return self.data_dir.resolve() / "calibrations"
+
+    @property
+    def is_database_embedded(self) -> bool:
+        """Whether the database is ours alone, and ``camind serve`` may migrate it."""
+        return self.effective_database_url.get_backend_name() == "sqlite"
+
+
+class Settings(StorageSettings):
+    """Everything an operator can choose. Durations in seconds, sizes in bytes, images in pixels."""
+
     model_dir: Annotated[Folder, Field(description="Model folder to serve; default: the shipped model")] = SHIPPED_MODEL
     precision: Annotated[
         Literal["float32", "int8"], Field(description="Numbers the graphs compute with; int8: model_dir/int8")
@@ -141,24 +182,6 @@ class Settings(BaseSettings):
     ] = "console"
 
     @model_validator(mode="after")
-    def _check_database(self) -> Self:
-        scheme = self.database_url.partition(":")[0]
-        if self.database_url and scheme not in DATABASE_SCHEMES:
-            raise ValueError(f"{ENV_PREFIX}DATABASE_URL must begin with one of {', '.join(DATABASE_SCHEMES)}")
-        try:
-            url = self.effective_database_url
-            url.get_dialect()().create_connect_args(url)
-        except (ArgumentError, ValueError) as exc:
-            # what was read wrongly may be a part of the password
-            raise ValueError(
-                f"{ENV_PREFIX}DATABASE_URL cannot be read: write sqlite:////folder/file or "
-                "postgresql+psycopg://user:password@host:port/name, other signs than letters and digits as %XX"
-            ) from exc
-        if self.is_database_embedded and (url.database in (None, "", ":memory:") or "uri" in url.query):
-            raise ValueError(f"{ENV_PREFIX}DATABASE_URL names no file: write sqlite:////folder/file")
-        return self
-
-    @model_validator(mode="after")
     def _check_threads(self) -> Self:
         cores = available_cores()
         if self.worker_slots * self.threads_per_worker > cores:
@@ -182,23 +205,6 @@ class Settings(BaseSettings):
     def served_model_dir(self) -> Path:
         """The model folder whose graphs compute with the numbers that are wanted."""
         return self.model_dir / INT8 if self.precision == INT8 else self.model_dir
-
-    @property
-    def effective_database_url(self) -> URL:
-        """The database's URL, the default file in the data folder filled in."""
-        if self.database_url:
-            return make_url(self.database_url)
-        return URL.create("sqlite", database=str(self.data_dir.resolve() / DATABASE_FILE))
-
-    @property
-    def spool_dir(self) -> Path:
-        """Where photographs lie until their calibration ends."""
-        return self.data_dir.resolve() / "calibrations"
-
-    @property
-    def is_database_embedded(self) -> bool:
-        """Whether the database is ours alone, and ``camind serve`` may migrate it."""
-        return self.effective_database_url.get_backend_name() == "sqlite"
 
     @property
     def wants_keys(self) -> bool:
@@ -229,9 +235,17 @@ def load_settings(**overrides: object) -> Settings:
 
     Raises ``SettingsError``, one line per wrong value.
     """
-    given: dict[str, Any] = {name: value for name, value in overrides.items() if value is not None}
+    return _load(Settings, {name: value for name, value in overrides.items() if value is not None})
+
+
+def load_storage_settings() -> StorageSettings:
+    """Those of them that say where the data are; the others may be wrong. Raises ``SettingsError``."""
+    return _load(StorageSettings, {})
+
+
+def _load(kind: type[Kind], given: dict[str, Any]) -> Kind:
     try:
-        return Settings(**given)
+        return kind(**given)
     except ValidationError as exc:
         raise SettingsError("\n".join(_fault_line(dict(fault)) for fault in exc.errors())) from exc
 

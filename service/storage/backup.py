@@ -26,6 +26,8 @@ from service.storage.engine import SQLITE_DAMAGED, open_engine
 
 BUSY_TIMEOUT_S = 30.0
 READ_BYTES = 1 << 20
+# how its custom format, its SQL and its tar begin
+OF_PG_DUMP = (b"PGDMP", b"--\n-- PostgreSQL database", b"toc.dat")
 # what SQLite keeps beside a database; of another database they would be played into it
 SIDE_FILES = ("-journal", "-wal", "-shm")
 # what only writing can end with
@@ -125,6 +127,7 @@ def newest(source: Path, database: Path, spool: str | None) -> Iterator[tuple[Pa
     """
     if not source.is_file():
         raise DatabaseFileError(f"There is no backup at {source}.")
+    _require_no_dump(source)
     with _replacing(database), _draft_beside(database) as draft:
         _require_known(_copied(source, draft, database), source)
         _make_ready(draft, spool)
@@ -150,7 +153,10 @@ def _replacing(database: Path) -> Iterator[None]:
 @contextmanager
 def _draft_beside(target: Path) -> Iterator[Path]:
     """An empty file that is to get the target's name, readable by its owner alone; gone afterwards if it did not."""
-    descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+    try:
+        descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+    except OSError as exc:
+        raise DatabaseFileError(f"No file can be made in the folder {target.parent}: {exc.strerror}.") from exc
     os.close(descriptor)
     draft = Path(name)
     try:
@@ -244,6 +250,15 @@ def _first(connection: sqlite3.Connection, query: Select[Any]) -> Any:
     """The first value of the first row; None without a row."""
     row = connection.execute(str(query)).fetchone()
     return row and row[0]
+
+
+def _require_no_dump(source: Path) -> None:
+    with source.open("rb") as file:
+        if file.read(64).startswith(OF_PG_DUMP):
+            raise DatabaseFileError(
+                f"{source} is a PostgreSQL database that pg_dump wrote: nothing was changed; put it into an empty "
+                "PostgreSQL database with pg_restore (psql, where it is SQL), and run `camind migrate`."
+            )
 
 
 def _require_known(contents: Contents, source: Path) -> None:

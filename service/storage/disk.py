@@ -14,8 +14,15 @@ NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
 def make_private(folder: Path) -> None:
-    """Make a folder that its owner alone can look into; one that is there stays as it is."""
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    """Make a folder that its owner alone can look into; one that is there stays as it is.
+
+    Raises ``OSError``, whose message says what to do.
+    """
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as exc:
+        told = f"The folder {folder} cannot be made ({exc.strerror}): set CAMIND_DATA_DIR or CAMIND_DATABASE_URL."
+        raise OSError(told) from exc
 
 
 def try_lock(path: Path, *, is_shared: bool = False) -> BinaryIO | None:

@@ -190,6 +190,20 @@ def test_a_target_without_room_is_named(database: Path, tmp_path: Path) -> None:
     assert files_of(tmp_path) == {"data"}
 
 
+def test_a_folder_that_takes_no_file_is_named(database: Path, tmp_path: Path) -> None:
+    told = f"No file can be made in the folder {tmp_path / 'absent'}: No such file or directory."
+    with pytest.raises(DatabaseFileError, match=re.escape(told)):
+        backup(database, tmp_path / "absent" / "copy.sqlite3")
+
+
+@pytest.mark.parametrize("begin", [b"PGDMP\x01\x0e", b"--\n-- PostgreSQL database dump\n--\n", b"toc.dat\0"])
+def test_what_pg_dump_wrote_is_no_matter_of_a_restore(tmp_path: Path, begin: bytes) -> None:
+    (tmp_path / "dump").write_bytes(begin + bytes(1000))
+    with pytest.raises(DatabaseFileError, match=r"that pg_dump wrote: .* with pg_restore"):
+        restore(tmp_path / "dump", tmp_path / "data" / "camind.sqlite3")
+    assert files_of(tmp_path) == {"dump"}
+
+
 def test_nothing_is_not_backed_up(tmp_path: Path) -> None:
     with pytest.raises(DatabaseFileError, match="no database"):
         backup(tmp_path / "absent.sqlite3", tmp_path / "copy.sqlite3")
