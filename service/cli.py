@@ -83,6 +83,7 @@ def serve(
         from service import logs, server
         from service.app import create_app
         from service.inference.artifact import load_model_folder
+        from service.storage.spool import Spool
 
     logs.configure(settings.log_level, settings.log_format)
     with _plain_failures():
@@ -96,6 +97,7 @@ def serve(
                 _seed(engine, LOCAL)
             if settings.wants_keys:
                 _require_key(settings, engine)
+        Spool(settings.spool_dir)
     address = f"[{settings.host}]" if ":" in settings.host else settings.host
     with suppress(OSError):  # a log's full disk is no reason not to serve
         typer.echo(f"camind on http://{address}:{listener.getsockname()[1]}", err=True)

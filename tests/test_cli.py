@@ -94,12 +94,17 @@ def test_a_broken_model_is_said(tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize("command", [("migrate",), ("cameras", "seed"), ("serve", "--port", "0")])
-def test_an_unusable_database_is_said(tmp_path: Path, tiny_model_dir: Path, command: tuple[str, ...]) -> None:
-    (tmp_path / "file").touch()
-    url = f"sqlite:///{tmp_path}/file/a.sqlite3"
+@pytest.mark.parametrize(
+    ("command", "folder"),
+    [(("migrate",), "data"), (("cameras", "seed"), "data"), (("serve", "--port", "0"), "calibrations")],
+)
+def test_a_folder_that_cannot_be_made_is_said(
+    tmp_path: Path, tiny_model_dir: Path, command: tuple[str, ...], folder: str
+) -> None:
+    (tmp_path / folder).touch()
+    url = f"sqlite:///{tmp_path}/data/a.sqlite3"
     done = camind(tmp_path, *command, CAMIND_DATABASE_URL=url, CAMIND_MODEL_DIR=str(tiny_model_dir))
-    told = f"The folder {tmp_path}/file cannot be made (File exists): set CAMIND_DATA_DIR or CAMIND_DATABASE_URL.\n"
+    told = f"The folder {tmp_path}/{folder} cannot be made (File exists): set CAMIND_DATA_DIR or CAMIND_DATABASE_URL.\n"
     assert (done.returncode, done.stderr) == (1, told)
 
 

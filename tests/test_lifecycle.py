@@ -3,6 +3,7 @@
 import http.client
 import json
 import os
+import shutil
 import signal
 import socket
 import sqlite3
@@ -154,9 +155,13 @@ def test_a_damaged_database_is_not_served(tmp_path: Path, tiny_model_dir: Path, 
 
 
 def test_an_app_that_does_not_start_ends_with_1(tmp_path: Path, tiny_model_dir: Path) -> None:
-    # the spool's folder cannot be made where a file has its name
-    (tmp_path / "calibrations").touch()
-    assert refused_start(tmp_path, tiny_model_dir).endswith("camind did not start: the log above says why.\n")
+    model_dir = Path(shutil.copytree(tiny_model_dir, tmp_path / "model"))
+    manifest = json.loads((model_dir / "manifest.json").read_text())
+    manifest["graphs"]["blur"]["outputs"].append({"name": "more", "shape": ["n"]})
+    (model_dir / "manifest.json").write_text(json.dumps(manifest))
+    told = refused_start(tmp_path, model_dir)
+    assert "lacks the outputs ['more']" in told
+    assert told.endswith("camind did not start: the log above says why.\n")
 
 
 def test_a_running_service_is_backed_up_and_not_restored(server: Server, tmp_path: Path) -> None:

@@ -116,7 +116,7 @@ def known_id(folder: Path) -> str | None:
 
 
 def _id_in(folder: Path) -> str:
-    """The folder's id; the first process that comes makes it, whole or not at all."""
+    """The folder's id; the first process that comes makes it, whole or not at all. Raises ``OSError``, in words."""
     path = folder / ID_FILE
     if not path.exists():
         draft = folder / f".{uuid4().hex}"
@@ -126,6 +126,8 @@ def _id_in(folder: Path) -> str:
                 write_through(file)
             with suppress(FileExistsError):
                 path.hardlink_to(draft)
+        except OSError as exc:
+            raise OSError(f"No file can be made in the folder {folder}: {exc.strerror}.") from exc
         finally:
             draft.unlink(missing_ok=True)
         sync_folder(folder)
