@@ -9,6 +9,7 @@ lets nobody make one, that one is skipped, and tests/api/test_full_storage.py ha
 import json
 import resource
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,34 @@ from tests.inference.photographs import corners, png
 
 JSON = {"Content-Type": "application/json"}
 DISK_BYTES = 2**20
+# with room for what one calibration holds, but not for all of them
+PRUNED_IN_LITTLE_ROOM = """
+import os, sys
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from uuid import uuid4
+from service.errors import InsufficientStorage
+from service.storage import schema
+from service.storage.calibrations import CalibrationDraft, Calibrations, StoredPicture
+from service.storage.engine import open_engine
+
+database, ballast = Path(sys.argv[1], "camind.sqlite3"), Path(sys.argv[1], "ballast")
+engine = open_engine(f"sqlite:///{database}")
+schema.upgrade(engine)
+calibrations = Calibrations(engine)
+for _ in range(10):
+    pictures = (StoredPicture("x" * 40_000, "focused"),)
+    calibrations.cancel(calibrations.add(CalibrationDraft(uuid4().hex, "a" * 32, "bench", {}, pictures)).id)
+with suppress(OSError), ballast.open("ab", buffering=0) as file:
+    while True:
+        file.write(bytes(4096))
+try:
+    calibrations.forget(datetime.now(UTC))
+except InsufficientStorage:
+    os.truncate(ballast, ballast.stat().st_size - 100_000)
+    print(calibrations.forget(datetime.now(UTC)))
+"""
 OWN_NAMESPACE = ("unshare", "--mount", "--map-root-user")
 
 
@@ -93,10 +122,14 @@ class SmallDisk:
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path, tiny_model_dir: Path) -> Iterator[SmallDisk]:
+def _own_namespace(tmp_path: Path) -> None:
     tried = subprocess.run([*OWN_NAMESPACE, "mount", "-t", "tmpfs", "none", tmp_path], check=False, capture_output=True)
     if tried.returncode != 0:
         pytest.skip("the kernel gives this user no mount namespace of its own")
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path, tiny_model_dir: Path, _own_namespace: None) -> Iterator[SmallDisk]:
     data_dir = tmp_path / "data"
     data_dir.mkdir()
     program = tmp_path / "camind-on-a-small-disk"
@@ -133,3 +166,10 @@ def test_a_full_disk_is_told_of_and_recovered_from(small_disk: SmallDisk) -> Non
     # a picture without a sheet: worked on all the same
     server.poll(lambda: server.ask("GET", path).json()["state"] == "failed")
     assert "Traceback" not in server.log
+
+
+@pytest.mark.usefixtures("_own_namespace")
+def test_calibrations_are_pruned_in_little_room(tmp_path: Path) -> None:
+    script = f'mount -t tmpfs -o size={DISK_BYTES} none "$2" && exec "$0" -c "$1" "$2"'
+    arguments = [*OWN_NAMESPACE, "sh", "-c", script, sys.executable, PRUNED_IN_LITTLE_ROOM, tmp_path]
+    assert subprocess.run(arguments, check=True, capture_output=True, text=True).stdout == "10\n"

@@ -17,8 +17,9 @@ from pydantic import JsonValue
 from sqlalchemy import Engine, delete, func, update
 from sqlalchemy.orm import aliased
 from sqlmodel import Session, col, select
+from sqlmodel.sql.expression import SelectOfScalar
 
-from service.errors import Conflict, NotFound
+from service.errors import Conflict, InsufficientStorage, NotFound
 from service.optics.camera import Camera
 from service.principal import LOCAL
 from service.storage.cameras import store_calibrated
@@ -287,19 +288,29 @@ class Calibrations:
             select(CalibrationRow.number)
             .where(~col(CalibrationRow.state).in_(LIVE), col(CalibrationRow.updated_at) < ended_before)
             .order_by(col(CalibrationRow.number))
-            .limit(FORGOTTEN_AT_A_TIME)
         )
         if self._owner is not None:
             ended = ended.where(col(CalibrationRow.owner) == self._owner)
-        forgotten = 0
+        forgotten, at_a_time = 0, FORGOTTEN_AT_A_TIME
         while True:
-            with writing(self._engine) as session:
-                numbers = session.exec(ended).all()
-                session.connection().execute(delete(CalibrationRow).where(col(CalibrationRow.number).in_(numbers)))
-            forgotten += len(numbers)
-            if len(numbers) < FORGOTTEN_AT_A_TIME:
+            try:
+                count = self._forget(ended.limit(at_a_time))
+            except InsufficientStorage:
+                # until it is deleted SQLite keeps as much of it beside its file: one finds room where fifty do not
+                if at_a_time == 1:
+                    raise
+                at_a_time = 1
+                continue
+            forgotten += count
+            if count < at_a_time:
                 return forgotten
             time.sleep(FORGETTING_PAUSE_S)
+
+    def _forget(self, ended: SelectOfScalar[int]) -> int:
+        with writing(self._engine) as session:
+            numbers = session.exec(ended).all()
+            session.connection().execute(delete(CalibrationRow).where(col(CalibrationRow.number).in_(numbers)))
+        return len(numbers)
 
     def _add(self, draft: CalibrationDraft, once: Once | None) -> CalibrationRecord:
         now, owner = datetime.now(UTC), self._owner or LOCAL
