@@ -29,7 +29,8 @@ READ_BYTES = 1 << 20
 # how its custom format, its SQL and its tar begin
 OF_PG_DUMP = (b"PGDMP", b"--\n-- PostgreSQL database", b"toc.dat")
 # what SQLite keeps beside a database; of another database they would be played into it
-SIDE_FILES = ("-journal", "-wal", "-shm")
+WAL = "-wal"
+SIDE_FILES = ("-journal", WAL, "-shm")
 # what only writing can end with
 UNWRITTEN = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_WRITE, sqlite3.SQLITE_IOERR_FSYNC, sqlite3.SQLITE_IOERR_TRUNCATE)
 
@@ -59,7 +60,9 @@ def database_file(database_url: str | URL) -> Path | None:
 
 @contextmanager
 def using(database_url: str | URL) -> Iterator[None]:
-    """Nobody restores the database meanwhile. Raises ``NotReady`` where somebody does."""
+    """Nobody restores the database meanwhile. Raises ``NotReady`` where somebody does, ``DatabaseFileError`` where it
+    has become empty, which SQLite would take for new.
+    """
     file = database_file(database_url)
     if file is None:
         yield
@@ -69,6 +72,11 @@ def using(database_url: str | URL) -> Iterator[None]:
     if lock is None:
         raise NotReady(f"The database {file} is being restored: start again when that is done.")
     with lock:
+        if _is_emptied(file):
+            raise DatabaseFileError(
+                f"The database {file} is damaged (it is empty, and its log {_beside(file, WAL)} is not): "
+                "put a backup in its place with `camind restore FILE`, which keeps both."
+            )
         yield
 
 
@@ -132,6 +140,12 @@ def newest(source: Path, database: Path, spool: str | None) -> Iterator[tuple[Pa
         _require_known(_copied(source, draft, database), source)
         _make_ready(draft, spool)
         yield draft, _contents(draft)
+
+
+def _is_emptied(database: Path) -> bool:
+    """Whether a log of writes is all that is left: SQLite would remove it when it opens the file."""
+    sizes = [path.stat().st_size if path.exists() else 0 for path in (database, _beside(database, WAL))]
+    return sizes[0] == 0 < sizes[1]
 
 
 def _lock_file(database: Path) -> Path:
@@ -285,11 +299,12 @@ def _keep(database: Path) -> Path | None:
     """A copy of the database under a dated name, damaged as it may be; None where there is none."""
     if not database.exists():
         return None
-    with suppress(DatabaseFileError), _opened(database) as connection:
-        # what a killed process left in a journal belongs to the copy
-        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        connection.execute("BEGIN IMMEDIATE")
-        connection.execute("ROLLBACK")
+    if not _is_emptied(database):
+        with suppress(DatabaseFileError), _opened(database) as connection:
+            # what a killed process left in a journal belongs to the copy
+            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            connection.execute("BEGIN IMMEDIATE")
+            connection.execute("ROLLBACK")
     kept = database.with_name(f"{database.name}.replaced-{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}")
     for suffix in SIDE_FILES:
         if _beside(database, suffix).exists():

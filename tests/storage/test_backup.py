@@ -233,6 +233,18 @@ def test_a_file_cut_short_is_found(database: Path) -> None:
         require_sound(database)
 
 
+def test_the_log_of_an_emptied_database_is_kept(database: Path, copy: Path) -> None:
+    log = database.with_name(f"{database.name}-wal")
+    log.write_bytes(b"what was written")
+    os.truncate(database, 0)
+    with pytest.raises(DatabaseFileError, match=r"it is empty, .* camind restore"), using(f"sqlite:///{database}"):
+        pass
+    _, kept = restore(copy, database)
+    assert kept is not None
+    assert kept.with_name(f"{kept.name}-wal").read_bytes() == b"what was written"
+    assert (names_in(database), log.exists()) == (["new"], False)
+
+
 def test_what_is_not_there_yet_is_sound(tmp_path: Path) -> None:
     require_sound(tmp_path / "absent.sqlite3")
     assert files_of(tmp_path) == set()
