@@ -237,7 +237,7 @@ def test_the_log_of_an_emptied_database_is_kept(database: Path, copy: Path) -> N
     log = database.with_name(f"{database.name}-wal")
     log.write_bytes(b"what was written")
     os.truncate(database, 0)
-    with pytest.raises(DatabaseFileError, match=r"it is empty, .* camind restore"), using(f"sqlite:///{database}"):
+    with pytest.raises(DatabaseFileError, match=r"it is empty, .*`camind restore"), using(f"sqlite:///{database}"):
         pass
     _, kept = restore(copy, database)
     assert kept is not None
