@@ -82,6 +82,12 @@ def test_every_metric_is_listed() -> None:
     assert {name.removesuffix("_total").removesuffix("_info") for name in named} == kept
 
 
+def test_every_event_of_the_log_is_listed() -> None:
+    named = re.findall(r"`(\w+)`", " ".join(f"`{name}`" for name in rows_below("Log")))
+    sources = [path.read_text() for path in (ROOT / "service").rglob("*.py")]
+    assert sorted(named) == sorted({event for text in sources for event in re.findall(r'log\.\w+\(\s*"(\w+)"', text)})
+
+
 def test_every_test_that_is_named_exists() -> None:
     named = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", OPERATIONS + SECURITY)
     assert len(named) > 10
