@@ -557,9 +557,15 @@ def _settings_said() -> Iterator[None]:
 
 
 def _require_key(settings: Settings, engine: Engine) -> None:
+    from service.storage import schema
     from service.storage.keys import Keys
 
-    if not Keys(engine).has_good():
+    try:
+        has_key = Keys(engine).has_good()
+    except CamindError:
+        schema.require_head(engine)  # which says it better
+        raise
+    if not has_key:
         raise _failure(
             f"Requests to {settings.host} need an API key, and there is none: make one with `camind keys create NAME`, "
             "or set CAMIND_API_KEYS=off to let everybody in.",

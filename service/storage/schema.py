@@ -42,7 +42,8 @@ def require_head(engine: Engine) -> None:
     current, head = current_revision(engine), head_revision()
     if current != head:
         _require_known(current)
-        raise NotReady(f"The database is at schema {current}, not at {head}: run `camind migrate`.")
+        found = f"is at schema {current}, not at {head}" if current else "has no tables yet"
+        raise NotReady(f"The database {found}: run `camind migrate`.")
 
 
 def upgrade(engine: Engine, revision: str = HEAD) -> None:

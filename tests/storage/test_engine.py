@@ -15,6 +15,7 @@ import pytest
 from sqlalchemy import Engine
 from sqlalchemy.exc import DatabaseError, IntegrityError
 
+from service.config import SettingsError
 from service.errors import Busy, NotReady
 from service.storage import postgresql, schema
 from service.storage.backup import using
@@ -117,6 +118,13 @@ def test_an_unreachable_server_is_not_ready(tmp_path: Path) -> None:
     engine = open_engine(f"postgresql+psycopg://nobody@/none?host={tmp_path}")
     with pytest.raises(NotReady), reading(engine) as session:
         session.connection()
+
+
+def test_a_missing_extra_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr("service.storage.postgresql")
+    monkeypatch.setitem(sys.modules, "service.storage.postgresql", None)
+    with pytest.raises(SettingsError, match=r"pip install 'camind\[postgres\]'"):
+        open_engine("postgresql+psycopg://nobody@/none")
 
 
 def test_no_free_connection_is_busy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ from sqlalchemy import JSON, Engine, Text, cast, select
 from typer.testing import CliRunner, Result
 
 from service import cli
+from service.config import Settings
 from service.errors import Conflict, NotReady
 from service.optics.camera import Camera, Intrinsics, Lens
 from service.storage import schema
@@ -165,8 +166,11 @@ def test_an_older_backup_comes_to_the_newest_schema(file: Path, server: Engine) 
 
 def test_a_database_without_tables_is_migrated_first(file: Path, postgres_url: str) -> None:
     engine = open_engine(postgres_url)
-    with pytest.raises(NotReady, match="camind migrate"):
+    told = "The database has no tables yet: run `camind migrate`"
+    with pytest.raises(NotReady, match=told):
         moved(file, engine)
+    with pytest.raises(NotReady, match=told):
+        cli._require_key(Settings(), engine)
     engine.dispose()
 
 
