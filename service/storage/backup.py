@@ -102,6 +102,8 @@ def backup(database: Path, target: Path, *, is_forced: bool = False) -> Contents
         raise DatabaseFileError(f"There is no database at {database}.")
     if target.exists() and target.samefile(database):
         raise DatabaseFileError(f"{target} is the database itself: choose another name.")
+    if target.exists() and not target.is_file():
+        raise DatabaseFileError(f"{target} is no file, and would be one afterwards: choose another name.")
     if target.exists() and not is_forced:
         raise DatabaseFileError(f"{target} is there already: choose another name, or overwrite it with --force.")
     with using(URL.create("sqlite", database=str(database))), _draft_beside(target) as draft:

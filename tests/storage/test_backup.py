@@ -171,6 +171,9 @@ def test_a_backup_overwrites_only_by_force(database: Path, tmp_path: Path) -> No
     assert target.read_bytes() == b"mine"
     backup(database, target, is_forced=True)
     assert names_in(target) == OLD
+    os.mkfifo(tmp_path / "device")
+    with pytest.raises(DatabaseFileError, match="no file"):
+        backup(database, tmp_path / "device", is_forced=True)
     (tmp_path / "link").symlink_to(database)
     for itself in (database, tmp_path / "link"):
         with pytest.raises(DatabaseFileError, match="the database itself"):
