@@ -13,7 +13,6 @@ from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from sqlalchemy.pool import ConnectionPoolEntry
 from sqlmodel import Session
 
-from service.config import SettingsError
 from service.errors import Busy, CamindError, InsufficientStorage, NotReady
 from service.storage.disk import make_private
 
@@ -35,7 +34,7 @@ POSTGRESQL_BUSY = ("55P03", "57014")
 def open_engine(database_url: str | URL) -> Engine:
     """An engine for the URL; the folder of an SQLite file is made. Nothing is connected yet.
 
-    Raises ``SettingsError`` where it names PostgreSQL and the extra is not installed.
+    Raises ``NotReady`` where it names PostgreSQL and the extra is not installed.
     """
     url = make_url(database_url)
     if url.get_backend_name() != "sqlite":
@@ -66,10 +65,7 @@ def _open_postgresql(url: URL) -> Engine:
     try:
         from service.storage import postgresql
     except ImportError as exc:
-        raise SettingsError(
-            "CAMIND_DATABASE_URL names a PostgreSQL database, and what speaks to it is not installed: "
-            f"pip install 'camind[postgres]' ({exc})."
-        ) from exc
+        raise NotReady("What speaks to PostgreSQL is not installed: pip install 'camind[postgres]'.") from exc
 
     arguments = postgresql.connect_args(url)
     engine = create_engine(

@@ -15,7 +15,6 @@ import pytest
 from sqlalchemy import Engine
 from sqlalchemy.exc import DatabaseError, IntegrityError
 
-from service.config import SettingsError
 from service.errors import Busy, NotReady
 from service.storage import postgresql, schema
 from service.storage.backup import using
@@ -123,7 +122,7 @@ def test_an_unreachable_server_is_not_ready(tmp_path: Path) -> None:
 def test_a_missing_extra_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr("service.storage.postgresql")
     monkeypatch.setitem(sys.modules, "service.storage.postgresql", None)
-    with pytest.raises(SettingsError, match=r"pip install 'camind\[postgres\]'"):
+    with pytest.raises(NotReady, match=r"pip install 'camind\[postgres\]'"):
         open_engine("postgresql+psycopg://nobody@/none")
 
 
