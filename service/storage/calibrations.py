@@ -306,7 +306,7 @@ class Calibrations:
                 return forgotten
             time.sleep(FORGETTING_PAUSE_S)
 
-    def _forget(self, ended: SelectOfScalar[int]) -> int:
+    def _forget(self, ended: SelectOfScalar[int] | SelectOfScalar[None]) -> int:
         with writing(self._engine) as session:
             numbers = session.exec(ended).all()
             session.connection().execute(delete(CalibrationRow).where(col(CalibrationRow.number).in_(numbers)))
