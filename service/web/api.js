@@ -146,7 +146,7 @@ function readProblem(status, headers, text) {
 	return new Problem({
 		status,
 		type: String(told.type ?? "about:blank"),
-		title: String(told.title ?? `The request failed (${status})`).replace(/[\w)]$/, "$&."),
+		title: String(told.title ?? `The request failed (${status}).`),
 		detail: String(told.detail ?? "The answer is not the service's own: something in front of it may have refused."),
 		errors: Array.isArray(told.errors) ? told.errors : [],
 		requestId: headers.get("X-Request-Id"),

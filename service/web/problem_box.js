@@ -14,7 +14,7 @@ export function ProblemBox({ problem, onRetry, onClose }) {
 	const isMoreThanDetail = errors.length > 1 || (errors.length === 1 && !detail.includes(errors[0].detail));
 	return html`
 		<div class="problem" role="alert">
-			<p><strong>${title}</strong> ${detail}</p>
+			<p><strong>${title.replace(/\w$/, "$&.")}</strong> ${detail}</p>
 			${isMoreThanDetail &&
 			html`<ul>${errors.map((fault) => html`<li><code>${fault.pointer.replace(/^#\//, "")}</code> ${fault.detail}</li>`)}</ul>`}
 			${requestId && html`<p class="hint" aria-live="off">Request ${requestId}</p>`}
