@@ -69,7 +69,7 @@ def test_a_robots_client_is_answered_as_its_page_says(server: Server, tmp_path: 
     page = (PICTURE.parents[1] / "robots.md").read_text()
     client = tmp_path / "frames.py"
     client.write_text(page.split("```python\n")[1].split("```")[0].replace("DEADLINE_S = 1.0", "DEADLINE_S = 60.0"))
-    command = [sys.executable, client, server.url.rstrip("/"), "d200", tmp_path / "frames.avi"]
+    command: list[str | Path] = [sys.executable, client, server.url.rstrip("/"), "d200", tmp_path / "frames.avi"]
     answered = subprocess.run(command, capture_output=True, text=True, check=True)
     said = r"\d+\.\d{6}: \d+\.\d\d s old, \d+% of \(432, 64[45]\) sure, fx 96\d\.\d px\n"
     assert re.fullmatch(said, answered.stdout)
