@@ -171,5 +171,5 @@ def test_a_full_disk_is_told_of_and_recovered_from(small_disk: SmallDisk) -> Non
 @pytest.mark.usefixtures("_own_namespace")
 def test_calibrations_are_pruned_in_little_room(tmp_path: Path) -> None:
     script = f'mount -t tmpfs -o size={DISK_BYTES} none "$2" && exec "$0" -c "$1" "$2"'
-    arguments = [*OWN_NAMESPACE, "sh", "-c", script, sys.executable, PRUNED_IN_LITTLE_ROOM, tmp_path]
+    arguments: list[str | Path] = [*OWN_NAMESPACE, "sh", "-c", script, sys.executable, PRUNED_IN_LITTLE_ROOM, tmp_path]
     assert subprocess.run(arguments, check=True, capture_output=True, text=True).stdout == "10\n"
