@@ -3,6 +3,7 @@
 import copy
 import pickle
 import re
+import shutil
 import signal
 from collections.abc import Iterator
 from dataclasses import replace
@@ -20,14 +21,12 @@ from rich.console import Console
 from model_export.batch_norms import folded, restored, spread_norms
 from model_export.checkpoint import Checkpoint, starting_pair
 from model_export.config import LARGE_SEED, MOST_SEED, Learning, SceneConfig, TrainConfig
-from model_export.devices import torch_threads
 from model_export.losses import UPRIGHT, UPSIDE_DOWN, Batch, likeness_loss, reduced, run_pair, told_by, total_loss
 from model_export.networks import Widths, make_pair, with_fresh_decoders
 from model_export.pool import HELD_OUT_SEED, Pools, collate
 from model_export.scenes import Material, draw_sample
 from model_export.textures import load_photographs
-from model_export.train import Trainer, config_of, emphasis, learning_rate, settling_step, train
-from service.cores import available_cores
+from model_export.train import CHECKPOINT, Trainer, config_of, emphasis, learning_rate, settling_step, train
 
 SHIPPED = Path(__file__).parents[2] / "service" / "models"
 SCENES = SceneConfig(size_px=32, margin_px=8)
@@ -71,10 +70,9 @@ def test_what_is_no_setting_is_refused_by_name(setting: str, said: str) -> None:
         TrainConfig().adjusted([setting])
 
 
-@pytest.fixture
-def textures(tmp_path: Path) -> Path:
-    folder = tmp_path / "textures"
-    folder.mkdir()
+@pytest.fixture(scope="module")
+def textures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("textures")
     rng = np.random.default_rng(0)
     cv2.imwrite(str(folder / "noise.png"), rng.integers(0, 255, (90, 120, 3), np.uint8))
     return folder
@@ -88,46 +86,66 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
+# a second thread has so little to do here that both only wait for each other
+train_here = partial(train, workers=0, threads=1)
+
+
 def run(config: TrainConfig, textures: Path, folder: Path) -> tuple[Checkpoint, str]:
     said = StringIO()
-    path = train(config, textures, folder, workers=0, console=Console(file=said, width=200))
+    path = train_here(config, textures, folder, console=Console(file=said, width=200))
     return Checkpoint.load(path), said.getvalue()
 
 
-def test_a_run_reports_and_ends_in_a_checkpoint(textures: Path, tmp_path: Path) -> None:
-    checkpoint, said = run(CONFIG, textures, tmp_path / "run")
-    assert checkpoint.step == 6
-    assert checkpoint.config == CONFIG
+@pytest.fixture(scope="module")
+def first_run(textures: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The checkpoint of a whole run, and what it said."""
+    folder = tmp_path_factory.mktemp("first")
+    said = run(CONFIG, textures, folder)[1]
+    return folder / CHECKPOINT, said
+
+
+@pytest.fixture
+def first(first_run: tuple[Path, str]) -> Checkpoint:
+    return Checkpoint.load(first_run[0])
+
+
+@pytest.fixture
+def own_copy(first_run: tuple[Path, str], tmp_path: Path) -> Path:
+    """That run's folder, to go on in."""
+    return Path(shutil.copytree(first_run[0].parent, tmp_path / "run"))
+
+
+def test_a_run_reports_and_ends_in_a_checkpoint(first_run: tuple[Path, str], first: Checkpoint) -> None:
+    said = first_run[1]
+    assert first.step == 6
+    assert first.config == CONFIG
     assert "step 3: loss" in said
     assert re.search("held-out scenes .* 4/4", said)
     assert "held out" in said
     assert "scenes/s, waited" in said
 
 
-def test_a_run_that_is_gone_on_with_keeps_its_settings_and_says_what_is_new(textures: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    run(CONFIG, textures, folder)
-    again = config_of(folder, ["steps=8", "learning_rate=5e-4"])
+def test_a_run_that_is_gone_on_with_keeps_its_settings_and_says_what_is_new(textures: Path, own_copy: Path) -> None:
+    again = config_of(own_copy, ["steps=8", "learning_rate=5e-4"])
     assert again == replace(CONFIG, steps=8, learning_rate=5e-4)
-    checkpoint, said = run(again, textures, folder)
+    checkpoint, said = run(again, textures, own_copy)
     assert checkpoint.step == 8
     assert "going on from step 6, with steps 8 for 6, learning_rate 0.0005 for 0.001" in said
     with pytest.raises(ValueError, match="at step 8"):
-        run(config_of(folder, ["steps=7"]), textures, folder)
+        run(config_of(own_copy, ["steps=7"]), textures, own_copy)
     with pytest.raises(ValueError, match="trains a compact pair"):
-        run(config_of(folder, ['kind="paper"']), textures, folder)
+        run(config_of(own_copy, ['kind="paper"']), textures, own_copy)
     with pytest.raises(ValueError, match="torch does not compute on cude"):
-        train(again, textures, folder, workers=0, device="cude")
+        train_here(again, textures, own_copy, device="cude")
 
 
 def test_a_run_at_its_end_says_so_and_draws_nothing(
-    textures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    textures: Path, own_copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run(CONFIG, textures, tmp_path / "run")
     monkeypatch.delattr("model_export.pool.draw_sample")
-    checkpoint, said = run(CONFIG, textures, tmp_path / "run")
+    checkpoint, said = run(CONFIG, textures, own_copy)
     assert checkpoint.step == 6
-    assert said.replace("\n", "").startswith(f"{tmp_path / 'run'} is at its end: go on with more --steps, or begin")
+    assert said.replace("\n", "").startswith(f"{own_copy} is at its end: go on with more --steps, or begin")
 
 
 def test_an_interrupted_run_saves_what_it_did(textures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,21 +159,20 @@ def test_an_interrupted_run_saves_what_it_did(textures: Path, tmp_path: Path, mo
     monkeypatch.setattr(Trainer, "advance", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run(CONFIG, textures, tmp_path / "run")
-    assert Checkpoint.load(tmp_path / "run" / "checkpoint.pt").step == 2
+    assert Checkpoint.load(tmp_path / "run" / CHECKPOINT).step == 2
     monkeypatch.undo()
     assert run(CONFIG, textures, tmp_path / "run")[0].step == CONFIG.steps
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut off", pickle.dumps({"steps": 3}, 2)])
 def test_what_is_no_checkpoint_is_said(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "checkpoint.pt"
+    path = tmp_path / CHECKPOINT
     path.write_bytes(content)
     with pytest.raises(ValueError, match="is no checkpoint of camind"):
         Checkpoint.load(path)
 
 
-def test_the_mean_of_two_checkpoints_lies_between_them(textures: Path, tmp_path: Path) -> None:
-    first, _ = run(CONFIG, textures, tmp_path / "first")
+def test_the_mean_of_two_checkpoints_lies_between_them(first: Checkpoint, textures: Path, tmp_path: Path) -> None:
     second, _ = run(replace(CONFIG, seed=2), textures, tmp_path / "second")
     mean = first.averaged(second, 0.25)
     for name, own in first.modules.items():
@@ -173,13 +190,12 @@ def test_the_mean_of_two_checkpoints_lies_between_them(textures: Path, tmp_path:
         first.averaged(replace(second, config=replace(CONFIG, kind="paper")))
 
 
-def test_a_new_run_begins_with_the_weights_it_is_told(textures: Path, tmp_path: Path) -> None:
-    first, _ = run(CONFIG, textures, tmp_path / "first")
+def test_a_new_run_begins_with_the_weights_it_is_told(first_run: tuple[Path, str], first: Checkpoint) -> None:
     trainer = Trainer(replace(CONFIG, seed=2), "cpu")
-    trainer.begin_with(starting_pair(tmp_path / "first" / "checkpoint.pt", "compact"))
+    trainer.begin_with(starting_pair(first_run[0], "compact"))
     assert trainer.step == 0
     torch.testing.assert_close(trainer.modules.state_dict(), first.modules)
-    for weights in (tmp_path / "first" / "checkpoint.pt", SHIPPED):
+    for weights in (first_run[0], SHIPPED):
         with pytest.raises(ValueError, match="do not fit"):
             starting_pair(weights, "paper")
 
@@ -209,15 +225,15 @@ def test_decoders_that_begin_anew_leave_the_encoders_as_they_were() -> None:
     assert not any(".encoder." in name or ".surroundings." in name for name in fresh)
 
 
-def test_norms_move_where_decoders_begin_anew(textures: Path, tmp_path: Path) -> None:
-    first, _ = run(CONFIG, textures, tmp_path / "first")
-    path = train(
+def test_norms_move_where_decoders_begin_anew(
+    first_run: tuple[Path, str], first: Checkpoint, textures: Path, tmp_path: Path
+) -> None:
+    path = train_here(
         replace(CONFIG, seed=2),
         textures,
         tmp_path / "second",
-        weights=tmp_path / "first" / "checkpoint.pt",
+        weights=first_run[0],
         fresh_decoders=True,
-        workers=0,
         console=Console(file=StringIO()),
     )
     second = Checkpoint.load(path)
@@ -226,16 +242,16 @@ def test_norms_move_where_decoders_begin_anew(textures: Path, tmp_path: Path) ->
     assert not any(torch.equal(second.modules[name], own) for name, own in running.items())
 
 
-def test_a_run_that_begins_with_weights_keeps_their_statistics(textures: Path, tmp_path: Path) -> None:
-    first, _ = run(CONFIG, textures, tmp_path / "first")
+def test_a_run_that_begins_with_weights_keeps_their_statistics(
+    first_run: tuple[Path, str], first: Checkpoint, textures: Path, tmp_path: Path
+) -> None:
     said = Console(file=StringIO())
     for steps in (3, 6):  # the second time it goes on
-        path = train(
+        path = train_here(
             replace(CONFIG, seed=2, steps=steps),
             textures,
             tmp_path / "second",
-            weights=tmp_path / "first" / "checkpoint.pt" if steps == 3 else None,
-            workers=0,
+            weights=first_run[0] if steps == 3 else None,
             console=said,
         )
     second = Checkpoint.load(path)
@@ -256,11 +272,10 @@ def test_a_stopped_run_goes_on_as_if_it_had_not_been_stopped(
     halfway = Trainer(config, "cpu")
     pool = Pools(config, Material(load_photographs(textures)), 0, 0)
     list(pool.fill())
-    with torch_threads(available_cores()):  # as without workers: other threads round otherwise
-        for step in range(3):
-            halfway.advance(pool.batch(step))
-            pool.refresh(step)
-    halfway.checkpoint().save(tmp_path / "stopped" / "checkpoint.pt")
+    for step in range(3):
+        halfway.advance(pool.batch(step))
+        pool.refresh(step)
+    halfway.checkpoint().save(tmp_path / "stopped" / CHECKPOINT)
     resumed, _ = run(config, textures, tmp_path / "stopped")
     for name, weight in whole.modules.items():
         torch.testing.assert_close(resumed.modules[name], weight, msg=name)
@@ -273,12 +288,9 @@ def test_some_steps_have_fewer_and_larger_pictures(textures: Path) -> None:
     assert shapes == 2 * [(8, 3, 32, 32), (8, 3, 32, 32), (2, 3, 64, 64)]
 
 
-def test_a_run_is_the_same_whoever_draws_its_scenes(textures: Path, tmp_path: Path) -> None:
-    alone, drawn = (
-        Checkpoint.load(train(CONFIG, textures, tmp_path / str(workers), workers=workers, threads=1))
-        for workers in (0, 2)
-    )
-    for name, weight in alone.modules.items():
+def test_a_run_is_the_same_whoever_draws_its_scenes(first: Checkpoint, textures: Path, tmp_path: Path) -> None:
+    drawn = Checkpoint.load(train(CONFIG, textures, tmp_path / "run", workers=2, threads=1))
+    for name, weight in first.modules.items():
         torch.testing.assert_close(drawn.modules[name], weight, rtol=0, atol=0, msg=name)
 
 
@@ -291,12 +303,15 @@ def test_a_run_is_the_same_whoever_draws_its_scenes(textures: Path, tmp_path: Pa
     ],
 )
 def test_a_run_moves_what_is_to_learn_and_nothing_else(
-    learning: Learning, parts: set[str], textures: Path, tmp_path: Path
+    learning: Learning,
+    parts: set[str],
+    first_run: tuple[Path, str],
+    first: Checkpoint,
+    textures: Path,
+    tmp_path: Path,
 ) -> None:
-    first, _ = run(CONFIG, textures, tmp_path / "first")
     config = replace(CONFIG, learning=learning)
-    path = train(config, textures, tmp_path / "next", weights=tmp_path / "first" / "checkpoint.pt", workers=0)
-    after = Checkpoint.load(path)
+    after = Checkpoint.load(train_here(config, textures, tmp_path / "next", weights=first_run[0]))
     moved = {name for name, own in first.modules.items() if not torch.equal(own, after.modules[name])}
     assert {".".join(name.split(".")[:2]) for name in moved} == parts
 
@@ -501,21 +516,20 @@ def test_a_config_survives_json() -> None:
 
 def test_a_folder_without_pictures_is_said(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="no JPEG or PNG"):
-        train(CONFIG, tmp_path, tmp_path / "run", workers=0)
+        train_here(CONFIG, tmp_path, tmp_path / "run")
 
 
 def test_a_run_that_began_with_a_teacher_goes_on_with_one(textures: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    path = train(replace(CONFIG, steps=3), textures, folder, teachers=[SHIPPED], workers=0)
+    path = train_here(replace(CONFIG, steps=3), textures, folder, teachers=[SHIPPED])
     assert Checkpoint.load(path).config.taught
     with pytest.raises(ValueError, match="begun with a --teacher: go on with one"):
-        train(CONFIG, textures, folder, workers=0)
-    assert Checkpoint.load(train(CONFIG, textures, folder, teachers=[SHIPPED], workers=0)).step == CONFIG.steps
+        train_here(CONFIG, textures, folder)
+    assert Checkpoint.load(train_here(CONFIG, textures, folder, teachers=[SHIPPED])).step == CONFIG.steps
 
 
-def test_a_checkpoint_of_another_version_says_so(textures: Path, tmp_path: Path) -> None:
-    train(CONFIG, textures, tmp_path, workers=0)
-    path = tmp_path / "checkpoint.pt"
+def test_a_checkpoint_of_another_version_says_so(own_copy: Path) -> None:
+    path = own_copy / CHECKPOINT
     content = torch.load(path, weights_only=True)
     content["config"]["forgotten"] = 1
     torch.save(content, path)
