@@ -57,8 +57,9 @@ chromium: ## Install Debian's Chromium for the tests of the page, where there is
 run: .venv/.service ## Start the service with the shipped model on http://127.0.0.1:8000
 	$(BIN)/camind serve --seed
 
+# each worker has a core: more threads of torch's would wait for each other
 test: setup chromium ## Run the tests
-	$(BIN)/pytest -n 2
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2
 
 soak: setup chromium ## Run the long versions of the tests that kill, fill and load the service: an hour or two
 	$(BIN)/pytest --soak -s $(SOAKED)
