@@ -11,9 +11,10 @@ from threadpoolctl import threadpool_limits
 
 from service.calibration import fit
 from service.calibration.edge import PointSpread, find_spread, fit_again
-from service.calibration.measure import LEAST_CIRCLES, Measured, measure, otherwise_sized
-from service.calibration.pose import FEW_VIEWS, Placement, PoseError, place
+from service.calibration.measure import LEAST_CIRCLES, Measured, ill_exposed, measure, otherwise_sized
+from service.calibration.pose import Placement, PoseError, place
 from service.calibration.report import Method, PictureReport, Report, Result, Role, Sample
+from service.calibration.solve import FEW_VIEWS
 from service.calibration.target import CircleGrid
 from service.errors import CamindError
 
@@ -145,6 +146,7 @@ def _result(task: Task, measured: list[Measured], at: Callable[[float], None]) -
         corner_ratio=corners,
         warnings=(
             *_left_out(measured, usable),
+            *ill_exposed(measured),
             *otherwise_sized(usable),
             *placement.warnings,
             *constants.warnings,

@@ -24,7 +24,12 @@ LEAST_CIRCLES = 4
 FLOOR_PX = 0.02
 FLOOR_PART = 0.02
 RESAMPLES = 200
-SHAPE_ERROR, PIXEL_ERROR_PX, FOCUS_ERROR = 0.003, 0.005, 5e-4  # of blur, gamma, focus: as simulated lenses show them
+# as simulated lenses show them: of all blur, and more for every doubling of it, of gamma, of the focus distance; and of
+# one picture's blur, and how it changes over a standard deviation of its depths
+SHAPE_ERROR, TREND_ERROR, PIXEL_ERROR_PX, FOCUS_ERROR = 0.003, 0.005, 0.005, 5e-4
+PICTURE_ERROR, SLOPE_ERROR = 0.005, 0.0015
+PRIOR_PICTURES = 4  # that these count as, beside what the pictures at hand show of their own
+MOST_SPAN = 10.0  # of an interval of k_cam, high over low: beyond, the pictures do not tell it
 CONFIDENCE = 0.95
 OUTLIER = 5.0
 LOOSE = 0.2
@@ -123,11 +128,11 @@ def fit_constants(
     resamples: int = RESAMPLES,
     tick: Callable[[], None] = lambda: None,
 ) -> Constants:
-    """The constants with 95 % intervals by a bootstrap over pictures; the focus distance is fitted unless given.
+    """The constants with 95 % intervals by a parametric bootstrap; the focus distance is fitted unless given.
 
     ``depth_error`` is the relative standard error that all depths have in common, as from the focal length; without
     ``resamples`` the intervals have no width. ``tick`` is called now and then. Raises ``FitError`` for fewer than four
-    circles or for circles that show no blur by defocus.
+    circles, for circles that show no blur by defocus, and where k_cam may be more than ten times as much as not.
     """
     defocused = ~circles.is_focused
     if defocused.sum() < LEAST_CIRCLES:
@@ -141,12 +146,20 @@ def fit_constants(
     if focus_distance_m is not None:
         doubt = _doubt(circles, focus_distance_m, partial(fit_at, None), depth_error)
     found = _constants(circles, partial(fit_at, focus_distance_m), focus_distance_m, depth_error, resamples)
-    if doubt is None:
-        return found
-    told, is_sure = doubt
-    if is_sure and found.k_cam_px.low <= 0:
-        raise FitError(told)
-    return replace(found, warnings=(told, *found.warnings))
+    told, is_sure = doubt or ("", False)
+    _check_span(found.k_cam_px, told if is_sure else "")
+    return replace(found, warnings=(told, *found.warnings)) if told else found
+
+
+def _check_span(k_cam: Interval, instead: str = "") -> None:
+    """Constants that may be anything are none: ``FitError``, which says what else is to blame where that is known."""
+    if k_cam.high <= MOST_SPAN * k_cam.low:
+        return
+    raise FitError(
+        instead
+        or f"k_cam_px may be anything from {k_cam.low:.2g} to {k_cam.high:.2g} by these photographs, which is no "
+        f"calibration: {BETTER}, so far that the circles are clearly blurred"
+    )
 
 
 def _doubt(circles: Circles, given_m: float, fit: Fit, depth_error: float) -> tuple[str, bool] | None:
@@ -204,7 +217,9 @@ def fit_as_paper(circles: Circles, focus_distance_m: float, *, depth_error: floa
         kept = k_cam[(k_cam >= low - FENCE * (high - low)) & (k_cam <= high + FENCE * (high - low))]
         return np.array([float(np.median(kept)), gamma, focus_distance_m])
 
-    return _constants(circles, fit, focus_distance_m, depth_error, resamples)
+    found = _constants(circles, fit, focus_distance_m, depth_error, resamples)
+    _check_span(found.k_cam_px)
+    return found
 
 
 def per_circle_k_cam(circles: Circles, gamma_px: float, focus_m: float) -> Array:
@@ -282,34 +297,61 @@ def _start(circles: Circles, focus_m: float) -> Array:
 
 
 def _resampled(circles: Circles, fit: Fit, best: Array, focus_m: float | None, depth_error: float, count: int) -> Array:
-    """Constants [count, 3] of pictures drawn with replacement (of circles, if there is one), always the same.
+    """Constants [count, 3] of pictures as the camera that was found might as well have given, always the same.
 
-    What all pictures have in common no drawing shows: depths and blur are in doubt alike, gamma by what cannot be told
-    from the pixel itself, and the focus distance unless it is given.
+    Each has errors of its own, as large as pictures' are that one curve is laid through. What all have in common no
+    picture shows: depths and blur are in doubt alike, gamma by what cannot be told from the pixel itself, and the focus
+    distance unless it is given.
     """
     rng = np.random.default_rng(0)
     focus_error = 0.0 if focus_m is not None else FOCUS_ERROR
-    labels = np.unique(circles.picture)
-    groups = [np.flatnonzero(circles.picture == label) for label in labels]
-    if len(groups) == 1:
-        groups = [np.array([i]) for i in range(circles.depth_m.size)]
+    shown = replace(circles, blur_px=_model(best, circles))
+    _, number = np.unique(circles.picture, return_inverse=True)
+    errors, offset = _errors(circles, shown.blur_px, number)
+    doublings = np.log2(shown.blur_px / np.median(shown.blur_px))
     rows = []
     for _ in range(count):
-        picked = rng.integers(0, len(groups), len(groups))
-        some = circles.only(np.concatenate([groups[i] for i in picked]))
-        depth, blur = np.exp(np.array([depth_error, SHAPE_ERROR]) * rng.standard_normal(2)).tolist()
-        row = fit(some.scaled(depth=depth, blur=blur), best).copy()
+        depth, shape, trend = np.array([depth_error, SHAPE_ERROR, TREND_ERROR]) * rng.standard_normal(3)
+        of_picture, slope = (error * rng.standard_normal(number.max() + 1)[number] for error in errors[:2])
+        off = shape + trend * doublings + of_picture + slope * offset + errors[2] * rng.standard_normal(number.size)
+        some = replace(shown, blur_px=shown.blur_px * np.exp(off))
+        row = fit(some.scaled(depth=math.exp(depth), blur=1.0), best).copy()
         row[1] += PIXEL_ERROR_PX * rng.standard_normal()
         row[2] *= 1 + focus_error * rng.standard_normal()
         rows.append(row)
     return np.array(rows)
 
 
+def _errors(circles: Circles, shown_px: Array, number: NDArray[np.int64]) -> tuple[tuple[float, float, float], Array]:
+    """Relative errors of blur: of a picture's, of how it changes over its depths, of a circle's; and those depths [n].
+
+    The depths are in standard deviations of each picture's. A curve that is laid through few pictures leaves none of
+    their errors to see: simulated ones count as some more pictures.
+    """
+    rest = np.log(circles.blur_px / shown_px)
+    offset, own = np.zeros_like(rest), np.zeros_like(rest)
+    medians, slopes = [], []
+    for picture in range(number.max() + 1):
+        of_it = number == picture
+        log_depth = np.log(circles.depth_m[of_it])
+        offset[of_it] = (log_depth - log_depth.mean()) / max(float(log_depth.std()), 1e-6)
+        medians.append(float(np.median(rest[of_it])))
+        slopes.append(float(np.median((rest[of_it] - medians[-1]) * offset[of_it])))
+        own[of_it] = rest[of_it] - medians[-1] - slopes[-1] * offset[of_it]
+    picture_error, slope_error = (
+        math.sqrt((PRIOR_PICTURES * usual**2 + float(np.square(seen).sum())) / _freedom(circles))
+        for usual, seen in ((PICTURE_ERROR, medians), (SLOPE_ERROR, slopes))
+    )
+    return (picture_error, slope_error, 1.4826 * float(np.median(np.abs(own)))), offset
+
+
+def _freedom(circles: Circles) -> int:
+    return PRIOR_PICTURES + max(np.unique(circles.picture).size - 3, 0)
+
+
 def _widening(circles: Circles) -> float:
-    """What a bootstrap over few pictures (over circles, if there is one) is too narrow by."""
-    pictures = np.unique(circles.picture).size
-    groups = pictures if pictures > 1 else circles.depth_m.size
-    return float(stdtrit(groups - 1, (1 + CONFIDENCE) / 2) / 1.96 * math.sqrt(groups / (groups - 1)))
+    """Student's law over the normal one: the errors of pictures are known from few."""
+    return float(stdtrit(_freedom(circles), (1 + CONFIDENCE) / 2) / 1.96)
 
 
 def _interval(value: float, drawn: Array, widen: float) -> Interval:
@@ -334,7 +376,7 @@ def _warnings(circles: Circles, found: tuple[Interval, Interval, Interval], *, i
     k_cam, gamma, focus = found
     told = []
     if np.unique(circles.picture).size < 3:
-        told.append("fewer than three pictures: the intervals are guesses")
+        told.append("fewer than three pictures: the intervals rest on what simulated ones are off by")
     depth_m = circles.depth_m[~circles.is_focused]
     near, far = (depth_m < focus.value).any(), (depth_m > focus.value).any()
     if not is_focus_given and not (near and far):

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from service.calibration.measure import CLIPPED_LEVEL, DARK_LEVEL, Measured, measure, otherwise_sized
+from service.calibration.measure import Measured, measure, otherwise_sized
 from service.calibration.pose import View, stand
 from service.calibration.report import PictureReport
 from service.calibration.target import CircleGrid
@@ -19,7 +19,6 @@ Exposure = Literal["good", "over", "under"]
 
 WHITE_LEVEL = 255
 MOST_MEASURED = 12
-CLIPPED_CIRCLES = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +80,7 @@ def look(
         blur_px=seen.report.blur_px,
         distance_m=distance_m,
         tilt_deg=tilt_deg,
-        exposure=_exposure(seen.paper_levels),
+        exposure="over" if seen.is_clipped else "under" if seen.is_dark else "good",
         paper_level=float(np.median(seen.paper_levels)) / WHITE_LEVEL,
         warnings=(*seen.report.warnings, *otherwise_sized([seen])),
     )
@@ -91,10 +90,3 @@ def _stride(grid: CircleGrid) -> int:
     """The step that visits at most a dozen circles, and every column in turn."""
     least = math.ceil(grid.rows * grid.columns / MOST_MEASURED)
     return next(step for step in itertools.count(least) if math.gcd(step, grid.columns) == 1)
-
-
-def _exposure(paper_levels: list[float]) -> Exposure:
-    levels = np.array(paper_levels)
-    if float((levels >= CLIPPED_LEVEL).mean()) > CLIPPED_CIRCLES:
-        return "over"
-    return "under" if float(np.median(levels)) < DARK_LEVEL else "good"

@@ -19,6 +19,7 @@ LEAST_CIRCLES = 8
 CLIPPED_LEVEL = 252
 DARK_LEVEL = 80  # of the paper: below, noise is a large part of the circles' contrast
 PLATEAU, PLATEAU_CIRCLES, LEAST_PLATEAU = 0.7, 0.5, 160  # of the paper at one level, of the circles so, from where on
+CLIPPED_CIRCLES = 0.1  # of a picture's, from where on it is overexposed
 OTHER_SIZE = 1.1  # paper shrinks and ink spreads less
 PAPER_FROM_RADII, PAPER_TO_RADII = 1.3, 1.6
 LUMINANCE = (0.2126, 0.7152, 0.0722)
@@ -37,6 +38,15 @@ class Measured:
     slices_px: list[float] = field(default_factory=list)  # lambda as the paper reads it, if asked for
     paper_levels: list[float] = field(default_factory=list)  # of the white around each circle looked at, 0 to 255
     plateaus: list[int] = field(default_factory=list)  # the level of those around which nearly all white has one
+
+    @property
+    def is_dark(self) -> bool:
+        return bool(self.paper_levels) and float(np.median(self.paper_levels)) < DARK_LEVEL
+
+    @property
+    def is_clipped(self) -> bool:
+        clipped = sum(level >= CLIPPED_LEVEL for level in self.paper_levels)
+        return clipped > CLIPPED_CIRCLES * len(self.paper_levels)
 
     def view(self) -> View:
         return View(np.array(self.circles, np.int64), np.array(self.centres_px, np.float64))
@@ -63,6 +73,20 @@ def otherwise_sized(measured: Sequence[Measured]) -> tuple[str, ...]:
         f"the circles are {ratio:.3g} times as large, beside what is between them, as was told: one of spacing_mm and "
         f"diameter_mm is not the sheet's, and metres follow spacing_mm{linear}",
     )
+
+
+def ill_exposed(measured: Sequence[Measured]) -> tuple[str, ...]:
+    """A warning where most photographs that show the sheet are too dark or too bright, beside what is said of each."""
+    shown = [one for one in measured if one.paper_levels]
+    dark, clipped = sum(one.is_dark for one in shown), sum(one.is_clipped for one in shown)
+    told = []
+    if 2 * dark > len(shown):
+        told.append(f"{dark} of {len(shown)} photographs are underexposed, which falsifies k_cam_px and gamma_px")
+    if 2 * clipped > len(shown):
+        told.append(
+            f"{clipped} of {len(shown)} photographs are overexposed: what is left of their circles looks sharper"
+        )
+    return tuple(told)
 
 
 def measure(
@@ -167,8 +191,8 @@ def _warn_of_plateau(out: Measured) -> None:
 
 def _warn_of_dark(out: Measured) -> None:
     """In the dark noise is as large as what tells blur, and cut off at black."""
-    level = float(np.median(out.paper_levels))
-    if level < DARK_LEVEL:
+    if out.is_dark:
+        level = float(np.median(out.paper_levels))
         out.warn(
             f"underexposed: the paper is at level {level:.0f} of 255, where noise falsifies blur: expose more, so that "
             "white is light grey"

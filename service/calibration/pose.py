@@ -1,12 +1,12 @@
 """Where the sheet was in every photograph, and the intrinsics that make it so: depth is z along the axis, not a ray."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from service.calibration.solve import CRITERIA, FEW_VIEWS, Solved, focal_error, solve
 from service.calibration.target import CircleGrid
 from service.opencv import cv2
 from service.optics.camera import Intrinsics
@@ -16,14 +16,12 @@ Array = NDArray[np.float64]
 BIAS_ROUNDS = 2
 RIM_POINTS = 48
 LEAST_VIEWS = 2
-FEW_VIEWS = 4
 LITTLE_TILT_DEG = 8.0
 BAD_RMS_PART = 0.008  # of the spacing
 FREE_VIEWS, CLEARLY = 6, 0.75
 TELL_BENT_PART = 0.025  # of the spacing
 MOST_FOCAL_ERROR = 0.1
 NEAR_M = 0.01  # all sheets nearer than that: their spacing may have been told in metres
-CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-10)
 
 
 class PoseError(Exception):
@@ -76,29 +74,27 @@ def place(grid: CircleGrid, views: Sequence[View], size_px: tuple[int, int]) -> 
     bent_mm = float(np.linalg.norm(board - flat, axis=1).max())
     turns = [np.asarray(cv2.Rodrigues(turn)[0]) for turn in solved.turns]
     depths = [
-        np.asarray((board[view.circles] @ turn.T)[:, 2] + float(shift[2, 0]), np.float64) / 1e3
+        np.asarray((board[view.circles] @ turn.T)[:, 2] + float(shift[2]), np.float64) / 1e3
         for view, turn, shift in zip(views, turns, solved.shifts, strict=True)
     ]
     middle = board.mean(0)
     tilts = [_tilt_deg(turn) for turn in turns]
-    distances = [
-        float((turn @ middle)[2] + shift[2, 0]) / 1e3 for turn, shift in zip(turns, solved.shifts, strict=True)
-    ]
+    distances = [float((turn @ middle)[2] + shift[2]) / 1e3 for turn, shift in zip(turns, solved.shifts, strict=True)]
     fx_px, fy_px, cx_px, cy_px = solved.matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-    focal_error = _focal_error(board, views, solved)
-    if focal_error > MOST_FOCAL_ERROR:
+    error = focal_error([board[view.circles] for view in views], solved, size_px)
+    if error > MOST_FOCAL_ERROR:
         raise PoseError(
             f"the focal length cannot be told from these sheets, tilted by at most {max(tilts):.0f} degrees: tilt the "
             "sheet by 15 to 25 degrees, this way and that"
         )
     return Placement(
-        Intrinsics(fx_px, fy_px, cx_px, cy_px, tuple(solved.distortion.ravel().tolist())),
+        Intrinsics(fx_px, fy_px, cx_px, cy_px, tuple(solved.distortion.tolist())),
         tuple(depths),
         tuple(distances),
         tuple(tilts),
         tuple(solved.errors.tolist()),
         solved.rms,
-        focal_error,
+        error,
         (*_near(distances), *_warnings(grid, views, solved, tilts), *_imperfect(grid, bent_mm)),
     )
 
@@ -127,24 +123,14 @@ def _tilt_deg(rotation: NDArray[np.generic]) -> float:
     return float(np.degrees(np.arccos(min(abs(rotation[2, 2]), 1.0))))
 
 
-@dataclass(frozen=True, slots=True)
-class _Solved:
-    rms: float
-    matrix: Array
-    distortion: Array
-    turns: tuple[Array, ...]
-    shifts: tuple[Array, ...]
-    errors: Array
-
-
 def _freed(
     flat: Array,
     grid: CircleGrid,
     views: Sequence[View],
     centres: Sequence[Array],
     size_px: tuple[int, int],
-    solved: _Solved,
-) -> tuple[Array, _Solved]:
+    solved: Solved,
+) -> tuple[Array, Solved]:
     """The sheet as it is, found along with the camera (Strobl and Hirzinger 2011), where that fits clearly better.
 
     Paper bends and printers stretch, by a millimetre. The mean size is kept: which of both is wrong cannot be known.
@@ -183,67 +169,15 @@ def _solved(
     views: Sequence[View],
     centres: Sequence[Array],
     size_px: tuple[int, int],
-    near: _Solved | None = None,
-) -> _Solved:
-    flags = cv2.CALIB_FIX_K3
-    if len(views) < FEW_VIEWS:
-        flags |= cv2.CALIB_FIX_K2 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_ASPECT_RATIO
-        flags |= cv2.CALIB_FIX_PRINCIPAL_POINT
-    start = np.array([[max(size_px), 0, (size_px[0] - 1) / 2], [0, max(size_px), (size_px[1] - 1) / 2], [0, 0, 1]])
-    if len(views) < FEW_VIEWS or near is not None:
-        flags |= cv2.CALIB_USE_INTRINSIC_GUESS
+    near: Solved | None = None,
+) -> Solved:
     try:
-        rms, matrix, distortion, turns, shifts, _, _, errors = cv2.calibrateCameraExtended(
-            [board[view.circles].astype(np.float32) for view in views],
-            [np.asarray(places, np.float32)[:, None] for places in centres],
-            size_px,
-            start.astype(np.float64) if near is None else near.matrix.copy(),
-            np.zeros(5) if near is None else near.distortion.copy(),
-            flags=flags,
-            criteria=CRITERIA,
-        )
+        return solve([board[view.circles] for view in views], centres, size_px, near)
     except cv2.error as error:
         raise PoseError("the sheets cannot be placed: no camera would see the grid like that") from error
-    return _Solved(
-        float(rms),
-        np.asarray(matrix, np.float64),
-        np.asarray(distortion, np.float64),
-        tuple(np.asarray(turn, np.float64) for turn in turns),
-        tuple(np.asarray(shift, np.float64) for shift in shifts),
-        np.asarray(errors, np.float64).ravel(),
-    )
 
 
-def _focal_error(board: Array, views: Sequence[View], solved: _Solved) -> float:
-    """The relative standard error of the focal length, all else that was fitted being free too.
-
-    OpenCV's own drops what the circles hardly tell, which of sheets that were never tilted is the focal length.
-    """
-    camera = 8 if len(views) >= FEW_VIEWS else 2  # what _solved lets free: the focal length alone, or all but k3
-    rows = []
-    for number, view in enumerate(views):
-        _, slopes = cv2.projectPoints(
-            board[view.circles], solved.turns[number], solved.shifts[number], solved.matrix, solved.distortion
-        )
-        slopes = np.asarray(slopes, np.float64)
-        row = np.zeros((len(slopes), 6 * len(views) + camera))
-        row[:, 6 * number : 6 * number + 6] = slopes[:, :6]
-        # the last is both focal lengths grown alike, by their logarithm
-        row[:, -1] = slopes[:, 6] * solved.matrix[0, 0] + slopes[:, 7] * solved.matrix[1, 1]
-        row[:, -2] = slopes[:, 10]
-        if camera > 2:
-            row[:, -8:-2] = slopes[:, [7, 8, 9, 11, 12, 13]]
-        rows.append(row)
-    jacobian = np.concatenate(rows)
-    freedom = len(jacobian) - jacobian.shape[1]
-    lengths = np.linalg.norm(jacobian, axis=0)
-    triangle = np.asarray(np.linalg.qr(jacobian / lengths, mode="r"))
-    told = float(abs(triangle[-1, -1]) * lengths[-1])
-    scatter_px = solved.rms * math.sqrt(len(jacobian) / 2 / freedom) if freedom > 0 else math.inf
-    return scatter_px / told if told > 0 else math.inf
-
-
-def _bias(board: Array, grid: CircleGrid, view: View, solved: _Solved, number: int) -> Array:
+def _bias(board: Array, grid: CircleGrid, view: View, solved: Solved, number: int) -> Array:
     """How far [k, 2] the middle of each circle's image is from the image of its centre, in px."""
     angle = np.arange(RIM_POINTS) * (2 * np.pi / RIM_POINTS)
     rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(RIM_POINTS)], 1) * grid.diameter_mm / 2
@@ -276,7 +210,7 @@ def _imperfect(grid: CircleGrid, bent_mm: float) -> list[str]:
     ]
 
 
-def _warnings(grid: CircleGrid, views: Sequence[View], solved: _Solved, tilts: list[float]) -> list[str]:
+def _warnings(grid: CircleGrid, views: Sequence[View], solved: Solved, tilts: list[float]) -> list[str]:
     told = []
     if len(views) < FEW_VIEWS:
         told.append(

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from model_export.photographed_sheets import picture
 from service.calibration.calibrate import Picture, Task, calibrate
+from service.calibration.measure import Measured, ill_exposed
 from service.calibration.plot import as_svg
 from service.calibration.report import PictureReport, Report
 from service.errors import InvalidImage
@@ -143,6 +144,15 @@ def test_one_that_moved_and_one_that_was_there_before_are_left_out(taken: list[S
 def test_of_four_photographs_none_is_left_out_for_its_blur(taken: list[SheetPhoto]) -> None:
     report = calibrate(Task(GRID), pictures([taken[0], moved(taken[2]), *taken[4:]]))
     assert not any(words.startswith("left out") for picture in report.pictures for words in picture.warnings)
+
+
+def test_what_most_photographs_are_exposed_like_is_said_once_more_of_all() -> None:
+    dark, good, bright = (
+        Measured(PictureReport("", "defocused", found=True), paper_levels=[level] * 9) for level in (40.0, 180.0, 254.0)
+    )
+    assert ill_exposed([dark, good, dark])[0].startswith("2 of 3 photographs are underexposed")
+    assert ill_exposed([good, bright, bright])[0].startswith("2 of 3 photographs are overexposed")
+    assert ill_exposed([dark, bright, good]) == ill_exposed([]) == ()
 
 
 def test_what_is_no_photograph_is_said_and_the_others_count(taken: list[SheetPhoto]) -> None:

@@ -88,7 +88,9 @@ def test_one_side_is_said_and_stated_wide() -> None:
     assert given.focus_distance_m.low == given.focus_distance_m.high == pytest.approx(FOCUS)
 
 
-@pytest.mark.parametrize(("given", "off"), [(0.97, 0), (1.0, 0), (1.015, 0), (1.05, 1), (0.95, 1), (1.12, 2), (0.8, 2)])
+@pytest.mark.parametrize(
+    ("given", "off"), [(0.985, 0), (1.0, 0), (1.015, 0), (0.97, 1), (1.05, 1), (0.95, 1), (1.12, 2), (0.8, 2)]
+)
 def test_a_focus_distance_that_the_pictures_contradict_is_said_and_one_far_off_is_an_error(
     given: float, off: int
 ) -> None:
@@ -215,3 +217,23 @@ def test_pictures_that_were_each_focused_elsewhere_are_to_be_taken_with_the_focu
     moved = replace(locked, depth_m=locked.depth_m * elsewhere)
     said = [" ".join(fit_constants(each, given, resamples=40).warnings) for each in (locked, moved)]
     assert ["lock the focus" in words for words in said] == [False, True]
+
+
+def test_a_k_cam_that_may_be_anything_is_none() -> None:
+    """As a phone's photographs show it: pictures differ, and not by defocus."""
+    some = circles((0.5, 0.6, 0.7, 0.8))
+    by_picture = replace(some, blur_px=np.array([0.43, 0.67, 0.46, 0.49])[some.picture])
+    with pytest.raises(FitError, match=r"k_cam_px may be anything from \S+ to \S+ by .* both nearer and farther"):
+        fit_constants(by_picture, resamples=20)
+
+
+@pytest.mark.parametrize("depths_m", [(0.6, 1.8), (0.5, 0.6, 0.7)])
+def test_the_intervals_of_few_pictures_hold_and_tell_something(depths_m: tuple[float, ...]) -> None:
+    """Errors as simulated lenses make them: of single pictures, and of all blur, more where it is larger."""
+    for seed in range(4):
+        some = circles(depths_m, error=0.005, seed=seed)
+        trend = 0.005 * np.random.default_rng(seed).standard_normal() * np.log2(some.blur_px / 2)
+        found = fit_constants(replace(some, blur_px=some.blur_px * np.exp(trend)), resamples=20)
+        for interval, true in ((found.k_cam_px, K_CAM), (found.focus_distance_m, FOCUS)):
+            assert interval.low <= true <= interval.high
+            assert interval.relative_width < (0.1 if len(depths_m) == 2 else 0.8)

@@ -122,11 +122,11 @@ def test_few_views_and_no_tilt_are_said_and_one_view_is_an_error() -> None:
 
 
 @pytest.mark.parametrize("count", [2, 3])
-def test_few_sheets_tell_the_focal_length_to_a_few_percent_with_the_axis_in_the_middle(count: int) -> None:
-    found = place(GRID, views(flat(), count)[0], SIZE).intrinsics
-    assert (found.fx_px, found.fy_px) == pytest.approx((1300, 1290), rel=0.04)
-    assert found.fx_px == found.fy_px
-    assert (found.cx_px, found.cy_px) == ((SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
+def test_few_sheets_tell_the_focal_length_as_well_as_they_say(count: int) -> None:
+    """Of a camera whose axis is not in the very middle and whose pixels are not quite square."""
+    found = place(GRID, views(flat(), count)[0], SIZE)
+    off = (found.intrinsics.fx_px / MATRIX[0, 0] - 1, found.intrinsics.fy_px / MATRIX[1, 1] - 1)
+    assert max(abs(part) for part in off) < 3 * found.focal_error < 0.01
 
 
 @pytest.mark.parametrize("tilted", [0.08, 0.15, 0.3])
