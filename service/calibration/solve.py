@@ -82,10 +82,12 @@ def focal_error(points: Sequence[Array], solved: Solved, size_px: tuple[int, int
     if freedom <= 0:
         return math.inf
     scatter_px = max(solved.rms * math.sqrt(len(slopes) / 2 / freedom), LEAST_SCATTER_PX)
-    told = np.concatenate([slopes / scatter_px, seen.held])
+    held = [seen.held] if len(points) < FEW_VIEWS else []  # as it was fitted
+    told = np.concatenate([slopes / scatter_px, *held])
     lengths = np.linalg.norm(told, axis=0)
     triangle = np.asarray(np.linalg.qr(told / lengths, mode="r"))
-    return 1 / float(abs(triangle[-1, -1]) * lengths[-1])
+    least = float(abs(triangle[-1, -1]) * lengths[-1])
+    return 1 / least if least > 0 else math.inf
 
 
 def _held(points: Sequence[Array], centres: Sequence[Array], size_px: tuple[int, int], at: Solved) -> Solved:
