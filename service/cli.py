@@ -48,6 +48,7 @@ calibrations_app = typer.Typer(help="The calibrations in the database.", no_args
 app.add_typer(calibrations_app, name="calibrations")
 keys_app = typer.Typer(help="The API keys: who may use the service.", no_args_is_help=True)
 app.add_typer(keys_app, name="keys")
+NEAREST_M, FARTHEST_M = FOCUS_DISTANCES_M
 Owner = Annotated[str, typer.Option(help="Whose they are. [default: whoever uses the service without a key]")]
 CameraName = Annotated[str, typer.Argument(help="Of the camera")]
 
@@ -222,10 +223,7 @@ def calibrate(
     spacing_mm: Annotated[float, typer.Option(help="The spacing s of the grid, as measured on the sheet")] = 20.0,
     diameter_mm: Annotated[float, typer.Option(help="Of each circle")] = 12.0,
     focus_distance_m: Annotated[
-        float | None,
-        typer.Option(
-            min=FOCUS_DISTANCES_M[0], max=FOCUS_DISTANCES_M[1], help="Where the lens is focused. [default: found]"
-        ),
+        float | None, typer.Option(min=NEAREST_M, max=FARTHEST_M, help="Where the lens is focused. [default: found]")
     ] = None,
     method: Literal["edge", "paper"] = "edge",
     out: Annotated[Path, typer.Option(help="Report to write; its plot goes beside it", dir_okay=False)] = Path(
