@@ -109,7 +109,12 @@ def test_a_broken_model_is_said(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("command", "folder"),
-    [(("migrate",), "data"), (("cameras", "seed"), "data"), (("serve", "--port", "0"), "calibrations")],
+    [
+        (("migrate",), "data"),
+        (("cameras", "seed"), "data"),
+        (("serve", "--port", "0"), "data"),
+        (("serve", "--port", "0"), "calibrations"),
+    ],
 )
 def test_a_folder_that_cannot_be_made_is_said(
     tmp_path: Path, tiny_model_dir: Path, command: tuple[str, ...], folder: str

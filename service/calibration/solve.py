@@ -158,8 +158,8 @@ class _Seen:
         for number, (_, slopes) in enumerate(self._projected(values)):
             row = np.zeros((len(slopes), values.size))
             row[:, 6 * number : 6 * number + 6] = slopes[:, :6]
-            row[:, -8] = slopes[:, 6] * matrix[0, 0]
-            row[:, -7:-1] = slopes[:, 8:14]
+            row[:, -CAMERA] = slopes[:, 6] * matrix[0, 0]
+            row[:, 1 - CAMERA : -1] = slopes[:, 8:14]
             row[:, -1] = slopes[:, 6] * matrix[0, 0] + slopes[:, 7] * matrix[1, 1]
             rows.append(row)
         return np.concatenate(rows)

@@ -4,6 +4,7 @@
 status, width and height, and after ``DECODED`` the pixels, 8-bit RGB in sRGB, a HEIC's upright, others as stored.
 """
 
+import importlib
 import os
 import resource
 import struct
@@ -54,8 +55,9 @@ def heic(data: bytes) -> Opened:
 
 def avif(data: bytes) -> Opened:
     """The first picture of an AVIF: its stated size, and how to decode it, as stored."""
-    from PIL import AvifImagePlugin, TiffImagePlugin  # noqa: F401 the second would be imported later, for EXIF
+    from PIL import AvifImagePlugin
 
+    importlib.import_module("PIL.TiffImagePlugin")  # reads EXIF, and could not be opened later
     AvifImagePlugin.DEFAULT_MAX_THREADS = 1
     shut_off()
     picture = AvifImagePlugin.AvifImageFile(BytesIO(data))
