@@ -41,15 +41,15 @@ def unseen_cases() -> Iterator[Case]:
 def record_corrections(model: Path, cases: Sequence[Case]) -> tuple[float, float]:
     """Find both for a model folder and write them into its manifest: ``blur_gain`` and ``temperature``.
 
-    Blur is that of scenes on either side of focus and on both. Errors are those where the side is told: being on the
-    wrong side of focus is what the other hypothesis is for. Raises ``ValueError`` for a model that no gain or no
-    temperature in bounds makes right.
+    Blur is that of scenes on either side of focus and on both. Errors are those that the depth graph states by itself
+    where the side is told: being on the wrong side of focus is what the other hypothesis is for. Raises ``ValueError``
+    for a model that no gain or no temperature in bounds makes right.
     """
     examiner = Examiner(model)
     seen = [examiner.answer(case)[0].blur for case in cases]
     gain = _corrected(model, "blur_gain", blur_gain(Pixels.joined([blur for blur in seen if blur is not None])))
     examiner = Examiner(model)
-    told = [examiner.answer_by(case.camera, case)[0].depth for case in cases if case.side != "auto"]
+    told = [examiner.stated_by_graph(case) for case in cases if case.side != "auto"]
     found = temperature(Pixels.joined(told))
     return gain, _corrected(model, "temperature", found)
 

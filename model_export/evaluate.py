@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_export.devices import one_core
-from model_export.evaluation_sets import Case, EvaluationSet
+from model_export.evaluation_sets import Case, EvaluationSet, Map
 from model_export.metrics import Scores, best_constant, completed, mean_scores, score
 from model_export.modes import (
     KNOWN_DEPTHS,
@@ -31,9 +31,9 @@ from model_export.summary import Example, Outcome, Pixels, Report, Sides, blur_r
 from service.cores import available_cores
 from service.inference.artifact import ModelFolder, load_model_folder
 from service.inference.cancellation import Cancellation
-from service.inference.depth_map import DepthMap, Layers
+from service.inference.depth_map import MAX_RELATIVE_ERROR, DepthMap, Layers, stated_error
 from service.inference.estimator import Estimator
-from service.inference.hypotheses import SIGMA_OF_LAPLACE
+from service.inference.hypotheses import SIGMA_OF_LAPLACE, in_metres
 from service.inference.known import KnownDepth
 from service.inference.pair import GraphPair, RawMaps, Sights
 from service.inference.resampling import Lines
@@ -115,14 +115,27 @@ class Examiner:
             return None
         read = self._estimator.read(case.image, case.camera, case.side)
         answer = read.maps["blur_px"] * (case.camera.image_width_px / read.camera.image_width_px)
-        rows, columns = (
-            ((np.arange(cells) + 0.5) * size / cells).astype(int)
-            for cells, size in zip(answer.shape, case.blur_px.shape, strict=True)
-        )
-        truth = case.blur_px[np.ix_(rows, columns)]
-        known = np.isfinite(truth)
         stated = np.exp(read.maps["blur_log_error"]) * SIGMA_OF_LAPLACE
-        return Pixels(truth[known], answer[known], stated[known])
+        return _at_cells(case.blur_px, answer, stated)
+
+    def stated_by_graph(self, case: Case) -> Pixels:
+        """The depth graph's hypothesis on the side that is told, and what it states by itself: no answer yet."""
+        read = self._estimator.read(case.image, case.camera, case.side)
+        answer_m = np.exp(read.maps[f"log_ratio_{case.side}"]) * np.float32(read.camera.focus_distance_m)
+        stated = stated_error(read.maps["log_scale"], read.camera, self._pair.manifest)
+        no_answer = stated > MAX_RELATIVE_ERROR
+        return _at_cells(case.truth_m, answer_m, np.where(no_answer, np.float32(np.inf), in_metres(stated)))
+
+
+def _at_cells(truth: Map, answer: Map, stated: Map) -> Pixels:
+    """The truth, where it is known, at the middles of the cells of a copy's maps."""
+    rows, columns = (
+        ((np.arange(cells) + 0.5) * size / cells).astype(int)
+        for cells, size in zip(answer.shape, truth.shape, strict=True)
+    )
+    truth = truth[np.ix_(rows, columns)]
+    known = np.isfinite(truth)
+    return Pixels(truth[known], answer[known], stated[known])
 
 
 @lru_cache(1)

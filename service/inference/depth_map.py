@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from service.inference.artifact import Manifest
+from service.inference.artifact import BLUR_ERROR_RANGE, Manifest
 from service.inference.hypotheses import SIGMA_OF_LAPLACE, in_metres, merged
 from service.inference.pair import RawMaps, Side
 from service.inference.part import Part
@@ -57,26 +57,30 @@ class Reading:
         """``photograph_size`` is (height, width). The maps are taken over and written over: they may be large.
 
         Where the side is given its hypothesis is the answer, or nothing where no far one can exist. No error is stated
-        below the floor of optics, and nothing answered of more blur than ``most_blur_px``, in pixels of the copy.
+        below the floor of optics, of an answer beyond focus none below what the error of blur makes of it, and nothing
+        is answered of more blur than ``most_blur_px``, in pixels of the copy.
         """
         blur_px, p_near = maps["blur_px"], maps["p_near"]
         depth_m, other_m, error = maps["log_ratio_near"], maps["log_ratio_far"], maps["log_scale"]
-        focus_m, temperature = np.float32(camera.focus_distance_m), _temperature(manifest, camera.k_cam_px)
+        focus_m = np.float32(camera.focus_distance_m)
         infinitely_far_px = thin_lens.blur_from_defocus(camera.k_cam_px, camera.gamma_px)
         nearest, farthest = manifest.ranges.depth_ratio
         scale = camera.image_width_px / photograph_size[1]
         if side != "auto":
             p_near.fill(side == "near")
         for rows in bands(blur_px.shape):
-            at_least_px = blur_px[rows] * exp(-2 * SIGMA_OF_LAPLACE * exp(maps["blur_log_error"][rows]))
+            blur_log_error = maps["blur_log_error"][rows]
+            at_least_px = blur_px[rows] * exp(-2 * SIGMA_OF_LAPLACE * exp(blur_log_error))
             has_far = at_least_px < infinitely_far_px
             near_m = exp(depth_m[rows]) * focus_m
             far_m = np.where(has_far, exp(other_m[rows]) * focus_m, near_m)
             if side != "far":
                 np.copyto(p_near[rows], 1, where=~has_far)
-            own = exp(error[rows]) * (SIGMA_OF_LAPLACE * temperature)
+            own = stated_error(error[rows], camera, manifest)
             answer_m, deviation, is_far = merged(near_m, far_m, p_near[rows], own)
             least = least_error(answer_m, camera)
+            blur_error = np.clip(stated_error(blur_log_error, camera, manifest), *BLUR_ERROR_RANGE)
+            np.maximum(deviation, _by_blur(answer_m, blur_px[rows], blur_error, camera), where=is_far, out=deviation)
             is_known = (np.fmax(own, least) <= MAX_RELATIVE_ERROR) & (blur_px[rows] <= most_blur_px)
             is_known &= (nearest * focus_m <= answer_m) & (answer_m <= farthest * focus_m)
             is_known &= has_far | (side != "far")
@@ -125,9 +129,22 @@ def least_error(depth_m: Array, camera: Camera) -> Array:
     return np.float32(per_metre) * depth_m
 
 
-def _temperature(manifest: Manifest, k_cam_px: float) -> np.float32:
-    """What errors are multiplied by: below those k_cam that the model knows they grow as what blur tells shrinks."""
-    return np.float32(manifest.temperature * max(1.0, manifest.ranges.k_cam_px.low / k_cam_px))
+def _by_blur(depth_m: Array, blur_px: Array, blur_error: Array, camera: Camera) -> Array:
+    """The relative error of depth that one of blur makes, relative too: dz/z = (z / s1) dx on either side of focus.
+
+    Beyond focus, where x nears 1 and blur tells less and less, the depth graph states too little by itself.
+    """
+    spread = thin_lens.relative_defocus_spread(blur_px, blur_error, camera.gamma_px, camera.k_cam_px)
+    return np.asarray(depth_m * spread / np.float32(camera.focus_distance_m), np.float32)
+
+
+def stated_error(log_scale: Array, camera: Camera, manifest: Manifest) -> Array:
+    """The standard deviation, relative, of a Laplace law that a network states by its ``log_scale``.
+
+    Below those k_cam that the model knows it is the larger, as what blur tells is the less.
+    """
+    times = manifest.temperature * max(1.0, manifest.ranges.k_cam_px.low / camera.k_cam_px)
+    return exp(log_scale) * (SIGMA_OF_LAPLACE * np.float32(times))
 
 
 @dataclass(frozen=True, slots=True)
