@@ -69,8 +69,8 @@ class Reading:
         if side != "auto":
             p_near.fill(side == "near")
         for rows in bands(blur_px.shape):
-            blur_log_error = maps["blur_log_error"][rows]
-            at_least_px = blur_px[rows] * exp(-2 * SIGMA_OF_LAPLACE * exp(blur_log_error))
+            blur_error = SIGMA_OF_LAPLACE * np.clip(exp(maps["blur_log_error"][rows]), *BLUR_ERROR_RANGE)
+            at_least_px = blur_px[rows] * exp(-2 * blur_error)
             has_far = at_least_px < infinitely_far_px
             near_m = exp(depth_m[rows]) * focus_m
             far_m = np.where(has_far, exp(other_m[rows]) * focus_m, near_m)
@@ -79,7 +79,6 @@ class Reading:
             own = stated_error(error[rows], camera, manifest)
             answer_m, deviation, is_far = merged(near_m, far_m, p_near[rows], own)
             least = least_error(answer_m, camera)
-            blur_error = np.clip(stated_error(blur_log_error, camera, manifest), *BLUR_ERROR_RANGE)
             np.maximum(deviation, _by_blur(answer_m, blur_px[rows], blur_error, camera), where=is_far, out=deviation)
             is_known = (np.fmax(own, least) <= MAX_RELATIVE_ERROR) & (blur_px[rows] <= most_blur_px)
             is_known &= (nearest * focus_m <= answer_m) & (answer_m <= farthest * focus_m)
@@ -139,7 +138,7 @@ def _by_blur(depth_m: Array, blur_px: Array, blur_error: Array, camera: Camera) 
 
 
 def stated_error(log_scale: Array, camera: Camera, manifest: Manifest) -> Array:
-    """The standard deviation, relative, of a Laplace law that a network states by its ``log_scale``.
+    """The relative standard deviation that the depth graph states of either hypothesis by its ``log_scale``.
 
     Below those k_cam that the model knows it is the larger, as what blur tells is the less.
     """

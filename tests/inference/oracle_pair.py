@@ -58,7 +58,7 @@ def brightness_for(blur_px: float) -> int:
     return round(255 * blur_px / WHITE_BLUR_PX)
 
 
-def blur_of(brightness: int) -> float:
+def blur_of(brightness: float) -> float:
     """The blur in pixels that the oracle reads off a grey level."""
     return brightness / 255 * WHITE_BLUR_PX
 

@@ -21,7 +21,13 @@ from service.inference.resampling import Lines
 from service.inference.session import Graph
 from service.optics import thin_lens
 from service.optics.camera import Camera, Intrinsics
-from tests.inference.oracle_pair import LOG_DEPTH_SCALE, blur_of, brightness_for, build_oracle_pair
+from tests.inference.oracle_pair import (
+    LOG_DEPTH_SCALE,
+    RELATIVE_BLUR_ERROR,
+    blur_of,
+    brightness_for,
+    build_oracle_pair,
+)
 
 CAMERA = Camera(96, 64, 2.0, 6.0, 0.5)
 
@@ -45,7 +51,7 @@ def stated(times: float) -> float:
     return float(in_metres(np.array(times * np.sqrt(2) * LOG_DEPTH_SCALE, np.float32)))
 
 
-def expected_x(level: int, camera: Camera = CAMERA) -> float:
+def expected_x(level: float, camera: Camera = CAMERA) -> float:
     return thin_lens.relative_defocus_from_blur(blur_of(level), camera.gamma_px, camera.k_cam_px)
 
 
@@ -125,6 +131,17 @@ def test_sigma_is_never_below_what_a_twentieth_of_a_pixel_does_to_depth(estimato
     assert (floor > np.sqrt(2) * LOG_DEPTH_SCALE * answer.depth_m).all()
     np.testing.assert_allclose(answer.sigma_m, in_metres(floor / answer.depth_m) * answer.depth_m, rtol=1e-4)
     assert (answer.sigma_m >= floor).all()
+
+
+@pytest.mark.parametrize("level", [80, 120])
+def test_beyond_focus_sigma_is_what_the_error_of_blur_makes_of_depth(estimator: Estimator, level: int) -> None:
+    near, far = (estimator.estimate(grey(level), CAMERA, side) for side in ("near", "far"))
+    np.testing.assert_allclose(near.sigma_m, stated(1) * near.depth_m, rtol=1e-4)
+    error = np.sqrt(2) * RELATIVE_BLUR_ERROR
+    x_low, x, x_high = (expected_x(level * times) for times in (1 / (1 + error), 1, 1 + error))
+    relative = np.full(1, (x_high - x_low) / 2 / (1 - x), np.float32)
+    assert relative > 2 * np.sqrt(2) * LOG_DEPTH_SCALE
+    np.testing.assert_allclose(far.sigma_m, in_metres(relative) * far.depth_m, rtol=1e-3)
 
 
 def test_by_a_k_cam_below_those_that_the_model_knows_errors_grow_until_nothing_is_answered(

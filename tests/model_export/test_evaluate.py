@@ -34,6 +34,7 @@ from model_export.report import beside, write
 from model_export.summary import EQUAL_BLUR_PX, Pixels, Relief, Report, Sides, blur_ranges, summarise
 from service.inference.artifact import Interval, load_model_folder, write_manifest
 from service.inference.hypotheses import in_metres
+from service.inference.pair import Side
 from service.optics import thin_lens
 from service.optics.camera import Camera
 from tests.inference.oracle_pair import LOG_DEPTH_SCALE, RELATIVE_BLUR_ERROR, blur_of, build_oracle_pair
@@ -305,6 +306,19 @@ def test_the_gain_makes_blur_right_in_the_median_where_it_is_well_read() -> None
     truth = np.array([0.5, 2, 4, 7.9, 16], np.float32)
     answer = truth * np.array([3, 1.25, 1.25, 1.0, 0.1], np.float32)
     assert blur_gain(Pixels(truth, answer, np.ones_like(truth))) == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize("side", ["near", "far"])
+def test_what_the_graph_states_by_itself_is_its_hypothesis_on_the_side_told_and_its_own_law(
+    oracle: Examiner, side: Side
+) -> None:
+    """Beyond focus an answer states more: what the error of blur makes of it. The temperature is not found of that."""
+    own = oracle.stated_by_graph(replace(case(1.0), side=side))
+    x = thin_lens.relative_defocus_from_blur(blur_of(LEVEL), CAMERA.gamma_px, CAMERA.k_cam_px)
+    depth_m = {"near": thin_lens.depth_near, "far": thin_lens.depth_far}[side](x, CAMERA.focus_distance_m)
+    np.testing.assert_allclose(own.answer, depth_m, rtol=1e-3)
+    np.testing.assert_allclose(own.stated, in_metres(np.full(1, np.sqrt(2) * LOG_DEPTH_SCALE, np.float32)), rtol=1e-3)
+    assert own.truth.size == 32 * 43
 
 
 def _told(found: float, _: Pixels) -> float:
