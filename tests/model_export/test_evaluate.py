@@ -317,7 +317,7 @@ def test_what_the_graph_states_by_itself_is_its_hypothesis_on_the_side_told_and_
     x = thin_lens.relative_defocus_from_blur(blur_of(LEVEL), CAMERA.gamma_px, CAMERA.k_cam_px)
     depth_m = {"near": thin_lens.depth_near, "far": thin_lens.depth_far}[side](x, CAMERA.focus_distance_m)
     np.testing.assert_allclose(own.answer, depth_m, rtol=1e-3)
-    np.testing.assert_allclose(own.stated, in_metres(np.full(1, np.sqrt(2) * LOG_DEPTH_SCALE, np.float32)), rtol=1e-3)
+    np.testing.assert_allclose(own.stated, in_metres(np.full_like(own.stated, np.sqrt(2) * LOG_DEPTH_SCALE)), rtol=1e-3)
     assert own.truth.size == 32 * 43
 
 
