@@ -56,16 +56,14 @@ class Reading:
     ) -> Self:
         """``photograph_size`` is (height, width). The maps are taken over and written over: they may be large.
 
-        Where the side is given its hypothesis is the answer, or nothing where no far one can exist. No error is stated
-        below the floor of optics, of an answer beyond focus none below what the error of blur makes of it, and nothing
-        is answered of more blur than ``most_blur_px``, in pixels of the copy.
+        Where the side is given its hypothesis is the answer, or nothing where no far one can exist; nothing of blur
+        over ``most_blur_px``. No error is stated below the floor of optics, nor beyond focus below what blur's makes.
         """
         blur_px, p_near = maps["blur_px"], maps["p_near"]
         depth_m, other_m, error = maps["log_ratio_near"], maps["log_ratio_far"], maps["log_scale"]
-        focus_m = np.float32(camera.focus_distance_m)
+        focus_m, scale = np.float32(camera.focus_distance_m), camera.image_width_px / photograph_size[1]
         infinitely_far_px = thin_lens.blur_from_defocus(camera.k_cam_px, camera.gamma_px)
         nearest, farthest = manifest.ranges.depth_ratio
-        scale = camera.image_width_px / photograph_size[1]
         if side != "auto":
             p_near.fill(side == "near")
         for rows in bands(blur_px.shape):
