@@ -68,16 +68,16 @@ class Reading:
             p_near.fill(side == "near")
         for rows in bands(blur_px.shape):
             blur_error = SIGMA_OF_LAPLACE * np.clip(exp(maps["blur_log_error"][rows]), *BLUR_ERROR_RANGE)
-            at_least_px = blur_px[rows] * exp(-2 * blur_error)
-            has_far = at_least_px < infinitely_far_px
+            has_far = blur_px[rows] * exp(-2 * blur_error) < infinitely_far_px
             near_m = exp(depth_m[rows]) * focus_m
             far_m = np.where(has_far, exp(other_m[rows]) * focus_m, near_m)
             if side != "far":
                 np.copyto(p_near[rows], 1, where=~has_far)
             own = stated_error(error[rows], camera, manifest)
             answer_m, deviation, is_far = merged(near_m, far_m, p_near[rows], own)
+            by_blur = _by_blur(answer_m[is_far], blur_px[rows][is_far], blur_error[is_far], camera)
+            deviation[is_far] = np.maximum(deviation[is_far], by_blur)
             least = least_error(answer_m, camera)
-            np.maximum(deviation, _by_blur(answer_m, blur_px[rows], blur_error, camera), where=is_far, out=deviation)
             is_known = (np.fmax(own, least) <= MAX_RELATIVE_ERROR) & (blur_px[rows] <= most_blur_px)
             is_known &= (nearest * focus_m <= answer_m) & (answer_m <= farthest * focus_m)
             is_known &= has_far | (side != "far")
@@ -127,12 +127,13 @@ def least_error(depth_m: Array, camera: Camera) -> Array:
 
 
 def _by_blur(depth_m: Array, blur_px: Array, blur_error: Array, camera: Camera) -> Array:
-    """The relative error of depth that one of blur makes, relative too: dz/z = (z / s1) dx on either side of focus.
+    """The relative error of depth that one of blur, relative too, makes on either side of focus.
 
-    Beyond focus, where x nears 1 and blur tells less and less, the depth graph states too little by itself.
+    Beyond it, where x nears 1 and blur tells less and less, the depth graph states too little by itself.
     """
-    spread = thin_lens.relative_defocus_spread(blur_px, blur_error, camera.gamma_px, camera.k_cam_px)
-    return np.asarray(depth_m * spread / np.float32(camera.focus_distance_m), np.float32)
+    k_cam_px = camera.k_cam_px
+    spread_px = thin_lens.relative_defocus_spread(blur_px, blur_error, camera.gamma_px, k_cam_px) * k_cam_px
+    return np.asarray(thin_lens.depth_error(depth_m, camera.focus_distance_m, k_cam_px, spread_px) / depth_m)
 
 
 def stated_error(log_scale: Array, camera: Camera, manifest: Manifest) -> Array:
