@@ -100,12 +100,13 @@ def blend(maps: RawMaps, coarse: RawMaps, ratio: Ratio, strong_px: float, *, by_
     # a copy's cells may cover half a cell less than there is
     wider = {name: _continued(values) for name, values in coarse.items()}
     for rows in bands((height, width)):
-        told = {name: sample(values, ratio, rows, width) for name, values in wider.items()}
-        told["blur_px"] /= np.float32(ratio.columns)
-        least_px = told["blur_px"] if by_coarse else np.minimum(told["blur_px"], maps["blur_px"][rows])
+        blur_px = sample(wider["blur_px"], ratio, rows, width) / np.float32(ratio.columns)
+        least_px = blur_px if by_coarse else np.minimum(blur_px, maps["blur_px"][rows])
         share = np.clip(log(least_px / np.float32(strong_px)) * OCTAVES, 0, 1)
-        for name, values in maps.items():
-            values[rows] += share * (told[name] - values[rows])
+        if share.any():
+            for name, values in maps.items():
+                told = blur_px if name == "blur_px" else sample(wider[name], ratio, rows, width)
+                values[rows] += share * (told - values[rows])
 
 
 def _continued(values: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -24,6 +24,7 @@ from service.inference.artifact import (
 )
 from service.inference.cancellation import Cancellation
 from service.inference.layout import add_odds, shrunk
+from service.inference.resampling import bands
 from service.inference.session import Graph
 from service.opencv import cv2, exp
 from service.optics import thin_lens
@@ -153,12 +154,17 @@ def _corrected(seen: RawMaps, camera: Camera, side: Side) -> RawMaps:
     """What the depth graph is given: blur with the camera taken out (eq. 6 and 7), and the camera itself."""
     blur_px = seen["blur_px"]
     gamma_px, k_cam_px = camera.gamma_px, camera.k_cam_px
-    relative_error = np.clip(exp(seen["blur_log_error"]), *BLUR_ERROR_RANGE)
+    defocus, spread = np.empty_like(blur_px), np.empty_like(blur_px)
+    for rows in bands(blur_px.shape[-2:]):
+        cells = (..., rows, slice(None))
+        error = np.clip(exp(seen["blur_log_error"][cells]), *BLUR_ERROR_RANGE)
+        defocus[cells] = thin_lens.relative_defocus_from_blur(blur_px[cells], gamma_px, k_cam_px)
+        spread[cells] = thin_lens.relative_defocus_spread(blur_px[cells], error, gamma_px, k_cam_px)
     focal_length_px = camera.intrinsics.fx_px if camera.intrinsics else 0.0
     return {
         **{name: value for name, value in seen.items() if name not in ("blur_px", "blur_log_error")},
-        "relative_defocus": thin_lens.relative_defocus_from_blur(blur_px, gamma_px, k_cam_px),
-        "relative_defocus_spread": thin_lens.relative_defocus_spread(blur_px, relative_error, gamma_px, k_cam_px),
+        "relative_defocus": defocus,
+        "relative_defocus_spread": spread,
         "focus_distance_m": np.array([camera.focus_distance_m], np.float32),
         "focal_length_px": np.array([focal_length_px], np.float32),
         "side": np.array([SIDE_HINTS[side]], np.float32),

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.inference.depth_map import MAX_RELATIVE_ERROR, MOST_STATED, Reading, least_error
-from service.inference.resampling import enlarged
+from service.inference.resampling import bands, enlarged
 from service.opencv import cv2, exp, log
 
 CELLS = 8  # of the maps, each way, whose mean is one in what surrounds them
@@ -54,10 +54,11 @@ def settle(reading: Reading, limits_m: tuple[float, float], stride: int, longer_
     in_doubt = np.minimum(read + doubt * gap**2, variance)
     towards = -off * in_doubt / (in_doubt + spread)
 
-    depth_m *= exp(_enlarged(towards, FEWER, depth_m.shape))
-    np.clip(depth_m, *limits_m, out=depth_m)
-    stated = np.clip(error, least_error(depth_m, reading.camera), MOST_STATED)
-    np.copyto(error, stated, where=error <= MAX_RELATIVE_ERROR)
+    towards = _enlarged(towards, FEWER, depth_m.shape)
+    for rows in bands(depth_m.shape):
+        depth_m[rows] = np.clip(depth_m[rows] * exp(towards[rows]), *limits_m)
+        stated = np.clip(error[rows], least_error(depth_m[rows], reading.camera), MOST_STATED)
+        np.copyto(error[rows], stated, where=error[rows] <= MAX_RELATIVE_ERROR)
 
 
 def _surroundings(depth_m: Array, certainty: Array, reach: int) -> tuple[Array, Array]:
