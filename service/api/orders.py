@@ -11,7 +11,13 @@ from service.inference.cancellation import Cancellation
 from service.inference.depth_map import DepthMap
 from service.inference.encode import ENCODERS, MAPS, MEDIA_TYPES, Beside, Encoded, pixel_at, read_point, spread_of
 from service.inference.estimator import Estimator
-from service.inference.frame import camera_of, maybe_another_part, maybe_seen_narrower, taken_otherwise
+from service.inference.frame import (
+    camera_of,
+    maybe_another_part,
+    maybe_seen_narrower,
+    maybe_wrong_specs,
+    taken_otherwise,
+)
 from service.inference.images import ImageLimits, read_photograph
 from service.inference.pair import Stopwatch
 from service.inference.part import Part
@@ -73,6 +79,7 @@ def fulfil(cancellation: Cancellation, order: Order, estimator: Estimator) -> An
     focus_is_told = order.query.focus_distance_m is not None or known
     focus_distance_m = None if focus_is_told else camera.focus_distance_m
     taken = taken_otherwise(photograph.exif, order.record.draft.lens, focus_distance_m)
+    specs = maybe_wrong_specs(order.record.draft.lens, order.record.camera)
     shown = maybe_another_part(photograph.exif, camera)
     has_points = not PROJECTED.isdisjoint(order.formats) and order.record.camera.intrinsics is None
     seen = maybe_seen_narrower(camera) if has_points else ()
@@ -80,7 +87,7 @@ def fulfil(cancellation: Cancellation, order: Order, estimator: Estimator) -> An
         pixel_at(point.u, point.v, whole, "known")
     depth_map = estimator.estimate(photograph.rgb, camera, order.query.side, cancellation, order.query.part, known)
     stopwatch.add(depth_map.timings_ms)
-    warnings = (*order.warnings, *photograph.warnings, *taken, *shown, *seen, *resized, *depth_map.warnings)
+    warnings = (*order.warnings, *photograph.warnings, *taken, *specs, *shown, *seen, *resized, *depth_map.warnings)
     origin = _origin_of(order, whole, estimator.manifest.name, depth_map.camera, warnings)
     beside = Beside(part.of(photograph.rgb), order.query.maps or MAPS, origin)
     longest_px = order.query.longest_px

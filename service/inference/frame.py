@@ -104,6 +104,22 @@ def _impossible_sensor(lens: Lens) -> Iterator[str]:
         )
 
 
+def maybe_wrong_specs(lens: Lens | None, camera: Camera) -> Iterator[str]:
+    """A warning where a camera came with both, and its lens specs are of another field of view than its intrinsics.
+
+    k_cam hangs on the same specs. That the lens is longer focused close is allowed for.
+    """
+    if lens is None or camera.intrinsics is None:
+        return
+    specs_px, seen_px = lens.fx_px(camera.image_width_px), camera.intrinsics.fx_px
+    longer = thin_lens.image_distance_in_focal_lengths(camera.focus_distance_m, lens.focal_length_m)
+    if not 1 / SAME_VIEW <= seen_px / specs_px <= SAME_VIEW * longer:
+        yield (
+            f"fx_px is {specs_px:.0f} by lens and {seen_px:.0f} by intrinsics: is focal_length_mm the 35-mm equivalent, or "
+            "pixel_pitch_um or sensor_width_px wrong? Metres are wrong by more than that if it is the lens"
+        )
+
+
 def _other_focus(exif: Exif, focus_distance_m: float) -> Iterator[str]:
     """What cameras note is coarse, and counts from the sensor in most, at 1:1 a few focal lengths more."""
     noted_m = exif.subject_distance_m

@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 
 from service.errors import ImageSizeMismatch
 from service.inference.exif import Exif
-from service.inference.frame import camera_of, maybe_another_part, maybe_seen_narrower, taken_otherwise
+from service.inference.frame import (
+    camera_of,
+    maybe_another_part,
+    maybe_seen_narrower,
+    maybe_wrong_specs,
+    taken_otherwise,
+)
 from service.inference.images import TURNS, Photograph, turned
 from service.opencv import cv2
 from service.optics import thin_lens
@@ -227,3 +233,26 @@ def test_a_focus_distance_that_may_be_in_millimetres_is_told(focus_m: float, *, 
 def test_specs_that_make_no_sensor_are_told(pitch_um: float, width_px: int, *, is_told: bool) -> None:
     said = [*taken_otherwise(Exif(), Lens(35.0, 1.4, pitch_um, width_px), 2.0)]
     assert ["which hardly can be" in words for words in said] == [True] * is_told
+
+
+@pytest.mark.parametrize(
+    ("lens", "focus_m", "fx_px", "is_told"),
+    [
+        (Lens(6.81, 1.85, 2.4, 4080), 0.5, 2860.0, False),
+        (Lens(25.0, 1.85, 2.4, 4080), 0.5, 2860.0, True),
+        (Lens(6.81, 1.85, 1.2, 4080), 0.5, 2860.0, True),
+        (Lens(6.81, 1.85, 2.4, 3072), 0.5, 2860.0, True),
+        (Lens(100.0, 2.8, 6.0, 6000), 0.2, 23_000.0, False),
+        (Lens(100.0, 2.8, 6.0, 6000), 5.0, 23_000.0, True),
+    ],
+    ids=["its lens", "equivalent", "unbinned pitch", "short side", "macro at 1:1", "far away"],
+)
+def test_a_lens_and_intrinsics_of_two_fields_of_view_are_told(
+    lens: Lens, focus_m: float, fx_px: float, *, is_told: bool
+) -> None:
+    size_px = (lens.sensor_width_px, 3000) if lens.focal_length_mm > 50 else (4080, 3072)
+    camera = Camera(*size_px, focus_m, 3.8, intrinsics=Intrinsics.centred(fx_px, *size_px))
+    said = [*maybe_wrong_specs(lens, camera)]
+    assert [f"{fx_px:.0f} by intrinsics" in words for words in said] == [True] * is_told
+    assert not [*maybe_wrong_specs(lens, replace(camera, intrinsics=None))]
+    assert not [*maybe_wrong_specs(None, camera)]
