@@ -182,6 +182,8 @@ def test_what_makes_clients_of_it_misreads_nothing(document: dict[str, Any]) -> 
     assert schemas["PointRead"]["properties"]["u"]["type"] == "number"  # a choice of numbers becomes a class
     assert schemas["Interval"]["items"] == {"type": "number"}  # not all know of prefixItems
     assert "minItems" not in json.dumps(document["paths"])  # Go's does not compile: a required field is there anyway
+    (form,) = document["paths"]["/calibrate"]["post"]["requestBody"]["content"].values()  # of a copy they make a type
+    assert form["schema"]["properties"]["settings"] == {"$ref": "#/components/schemas/CalibrationSettings"}
     errors = schemas["Problem"]["properties"]["errors"]
     assert "null" not in json.dumps(errors)
     assert "default" not in errors

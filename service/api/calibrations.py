@@ -64,9 +64,7 @@ HEADERS = {
     "Location": {"description": "The calibration's path", "schema": {"type": "string"}},
     "Preference-Applied": {"description": "The wait that was granted", "schema": {"type": "string"}},
 }
-# the schema among the components is that of an answer, where nothing is left out
-SETTINGS_SCHEMA = CalibrationSettings.model_json_schema(ref_template=REF)
-del SETTINGS_SCHEMA["$defs"]
+SETTINGS_SCHEMA = {"$ref": REF.format(model=CalibrationSettings.__name__)}
 FILES = {"type": "array", "items": {"type": "string", "format": "binary"}}
 
 router = APIRouter(tags=["calibration"])
