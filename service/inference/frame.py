@@ -115,8 +115,8 @@ def maybe_wrong_specs(lens: Lens | None, camera: Camera) -> Iterator[str]:
     longer = thin_lens.image_distance_in_focal_lengths(camera.focus_distance_m, lens.focal_length_m)
     if not 1 / SAME_VIEW <= seen_px / specs_px <= SAME_VIEW * longer:
         yield (
-            f"fx_px is {specs_px:.0f} by lens and {seen_px:.0f} by intrinsics: is focal_length_mm the 35-mm equivalent, "
-            "or pixel_pitch_um or sensor_width_px wrong? Metres are wrong by more than that if it is the lens"
+            f"fx_px is {specs_px:.0f} by lens and {seen_px:.0f} by intrinsics: is focal_length_mm the 35-mm "
+            "equivalent, or pixel_pitch_um or sensor_width_px wrong? Metres are wrong by more than that if it is the lens"
         )
 
 
