@@ -80,23 +80,24 @@ class Intrinsics:
     def turned(self, transposed: bool, flip_u: bool, flip_v: bool, size_px: tuple[int, int]) -> "Intrinsics":
         """The same camera after its picture was transposed, then flipped along u, then along v.
 
-        ``size_px`` is the width and height after the transposition. Tangential and thin-prism terms turn with
-        the picture; tilt terms (beyond the twelfth) have no turned form and are left out.
+        ``size_px`` is the width and height after the transposition. Tangential, thin-prism and tilt terms turn with the
+        picture; transposed, two tilts at once do so but for half their product.
         """
         if not (transposed or flip_u or flip_v):
             return self
         fx_px, fy_px, cx_px, cy_px = self.fx_px, self.fy_px, self.cx_px, self.cy_px
-        terms = list(self.distortion[:12])
+        terms = list(self.distortion)
         if transposed:
             fx_px, fy_px, cx_px, cy_px = fy_px, fx_px, cy_px, cx_px
             terms[2:4] = terms[3:1:-1]
             terms[8:12] = terms[10:12] + terms[8:10]
+            terms[12:14] = [-term for term in terms[:11:-1]]
         if flip_u:
             cx_px = size_px[0] - 1 - cx_px
-            terms = [-term if place in (3, 8, 9) else term for place, term in enumerate(terms)]
+            terms = [-term if place in (3, 8, 9, 13) else term for place, term in enumerate(terms)]
         if flip_v:
             cy_px = size_px[1] - 1 - cy_px
-            terms = [-term if place in (2, 10, 11) else term for place, term in enumerate(terms)]
+            terms = [-term if place in (2, 10, 11, 12) else term for place, term in enumerate(terms)]
         return Intrinsics(fx_px, fy_px, cx_px, cy_px, tuple(terms))
 
 

@@ -22,7 +22,7 @@ from service.opencv import cv2
 from service.optics import thin_lens
 from service.optics.camera import Camera, Intrinsics, Lens
 
-DISTORTION = (-0.1, 0.02, 0.003, -0.005, 0.001, 0.01, 0.002, 0.001, 0.004, -0.003, 0.002, 0.005)
+DISTORTION = (-0.1, 0.02, 0.003, -0.005, 0.001, 0.01, 0.002, 0.001, 0.004, -0.003, 0.002, 0.005, 0.09, 0.0)
 INTRINSICS = Intrinsics(500.0, 520.0, 300.0, 210.0, DISTORTION)
 CAMERA = Camera(640, 480, 2.0, 6.0, 0.5, intrinsics=INTRINSICS)
 

@@ -109,12 +109,13 @@ def test_range_ends_where_a_quarter_pixel_is_ten_percent() -> None:
     assert far == pytest.approx(0.1 * 2.0 * 3.81 / 0.25)
 
 
-def test_a_lens_that_tilts_loses_its_tilt_only_in_a_picture_that_is_turned() -> None:
+def test_a_lens_that_tilts_tilts_as_its_picture_is_turned() -> None:
     terms = tuple(0.01 * (number + 1) for number in range(14))
     inner = Intrinsics(500, 500, 320, 240, terms)
     assert inner.turned(False, False, False, (640, 480)).distortion == terms
-    assert inner.turned(False, True, True, (640, 480)).distortion[2:4] == (-terms[2], -terms[3])
-    assert len(inner.turned(False, True, True, (640, 480)).distortion) == 12
+    turned = inner.turned(False, True, True, (640, 480)).distortion
+    assert (turned[2:4], turned[12:]) == ((-terms[2], -terms[3]), (-terms[12], -terms[13]))
+    assert inner.turned(True, False, False, (480, 640)).distortion[12:] == (-terms[13], -terms[12])
 
 
 def test_both_axes_follow_their_own_ratio() -> None:
