@@ -352,7 +352,9 @@ class PreviewRead(BaseModel):
     source: Source
     fx_px: Annotated[float | None, Field(description="From the intrinsics or the lens, else null")]
     range_m: RangeRead
-    points: Annotated[list[CurvePoint], Field(description="Blur from a fifth to five times the focus distance")]
+    points: Annotated[
+        list[CurvePoint], Field(description="Blur by distance, as `GET /cameras/{name}/curve` has it by default")
+    ]
 
     @classmethod
     def from_draft(cls, draft: CameraDraft, points: list[CurvePoint]) -> Self:

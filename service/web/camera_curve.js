@@ -25,8 +25,8 @@ export function CameraCurve({ camera, points }) {
 			y=${{ label: "blur", unit: "px", from: 0 }}
 			marks=${[
 				{ x: camera.focus_distance_m, label: "in focus" },
-				...(far < points.at(-1).depth_m && far > points[0].depth_m ? [{ x: far, label: "range ends" }] : []),
-			]}
+				{ x: far, label: "range ends" },
+			].filter(({ x }) => x < points.at(-1).depth_m && x > points[0].depth_m)}
 			series=${[
 				{ name: "", kind: "line", tone: "one", points: points.map((point) => ({ x: point.depth_m, y: point.blur_px })) },
 			]}

@@ -202,6 +202,9 @@ def test_the_curve_spans_the_focus_by_default(client: TestClient, phone: dict[st
     assert points[0]["depth_m"] < 2 < points[-1]["depth_m"]
     beyond = client.get("/cameras/pixel7-wide/curve?near_m=50").json()["points"]
     assert (beyond[0]["depth_m"], len(beyond)) == (50, 101)
+    infinite = phone | {"focus_distance_m": 1e5, "k_cam_px": 5e-5}
+    points = client.post("/cameras/preview", json=infinite).json()["points"]
+    assert (points[0]["depth_m"], points[-1]["depth_m"]) == pytest.approx((0.4, 10))  # its range ends at 2 m
 
 
 @pytest.mark.parametrize(
