@@ -14,6 +14,7 @@ from service.inference.estimator import Estimator
 from service.inference.frame import (
     camera_of,
     maybe_another_part,
+    maybe_of_another_size,
     maybe_seen_narrower,
     maybe_wrong_specs,
     taken_otherwise,
@@ -79,9 +80,10 @@ def fulfil(cancellation: Cancellation, order: Order, estimator: Estimator) -> An
     focus_is_told = order.query.focus_distance_m is not None or known
     focus_distance_m = None if focus_is_told else camera.focus_distance_m
     taken = taken_otherwise(photograph.exif, order.record.draft.lens, focus_distance_m)
-    specs = maybe_wrong_specs(order.record.draft.lens, order.record.camera)
+    registered = order.record.camera
+    specs = (*maybe_of_another_size(registered), *maybe_wrong_specs(order.record.draft.lens, registered))
     shown = maybe_another_part(photograph.exif, camera)
-    has_points = not PROJECTED.isdisjoint(order.formats) and order.record.camera.intrinsics is None
+    has_points = not PROJECTED.isdisjoint(order.formats) and registered.intrinsics is None
     seen = maybe_seen_narrower(camera) if has_points else ()
     for point in known:
         pixel_at(point.u, point.v, whole, "known")

@@ -14,6 +14,7 @@ FOCUS_TOLERANCE = 0.15
 AS_INFINITY_M = 50.0  # from where on no ring has a figure but that of infinity
 SENSOR_WIDTHS_MM = (0.5, 100.0)  # an endoscope's, and more than a digital back's
 VIEW_TOLERANCE = 1.05
+MOST_OFF_MIDDLE = 1 / 8  # of width or height: a sensor is put into its camera better than that
 SAME_VIEW = 1.25  # equivalents are rounded, and count the whole of a sensor that 16:9 or a square is cut out of
 
 
@@ -101,6 +102,20 @@ def _impossible_sensor(lens: Lens) -> Iterator[str]:
         yield (
             f"lens.pixel_pitch_um times lens.sensor_width_px is a sensor {lens.sensor_width_mm:.3g} mm wide, which "
             "hardly can be: k_cam and metres are wrong if it is not"
+        )
+
+
+def maybe_of_another_size(camera: Camera) -> Iterator[str]:
+    """A warning where intrinsics put the axis far off the middle: what was calibrated at another size is so."""
+    known = camera.intrinsics
+    if known is None:
+        return
+    width_px, height_px = camera.image_width_px, camera.image_height_px
+    off = max(abs((known.cx_px + 0.5) / width_px - 0.5), abs((known.cy_px + 0.5) / height_px - 0.5))
+    if off > MOST_OFF_MIDDLE:
+        yield (
+            f"intrinsics put the axis at ({known.cx_px:.4g}, {known.cy_px:.4g}) of {width_px}x{height_px} pixels: "
+            "they are to be those of pictures of the camera's size"
         )
 
 

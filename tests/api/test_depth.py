@@ -313,9 +313,13 @@ def test_a_photograph_by_another_lens_is_warned_of(client: TestClient, d200: dic
     cropped = with_exif(jpeg(grey(60, 432, 645)), exif_of({}, {0x920A: (35, 1), 0xA405: 105}))
     warned = ask(client, cropped, {"Content-Type": "image/jpeg"}, camera="d200").headers["Camind-Warnings"]
     assert warned.startswith("its EXIF says it shows what 105 mm show on 35-mm film, the camera what 53.7 do")
-    client.post("/cameras", json=d200 | {"name": "both", "intrinsics": CAMERA["intrinsics"]})
-    warned = ask(client, png(grey(60, 432, 645)), camera="both").headers["Camind-Warnings"]
-    assert warned.startswith("fx_px is 964 by lens and 300 by intrinsics")
+
+
+def test_intrinsics_that_cannot_be_the_camera_s_are_warned_of(client: TestClient, d200: dict[str, Any]) -> None:
+    client.post("/cameras", json=d200 | {"intrinsics": CAMERA["intrinsics"]})
+    warned = ask(client, png(grey(60, 432, 645)), camera="d200").headers["Camind-Warnings"].split("; ")
+    assert warned[0].startswith("intrinsics put the axis at (40, 30) of 645x432 pixels")
+    assert warned[1].startswith("fx_px is 964 by lens and 300 by intrinsics")
 
 
 def test_a_focus_that_the_photograph_notes_is_no_matter_where_it_is_told_or_follows(bench: TestClient) -> None:

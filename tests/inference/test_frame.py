@@ -13,6 +13,7 @@ from service.inference.exif import Exif
 from service.inference.frame import (
     camera_of,
     maybe_another_part,
+    maybe_of_another_size,
     maybe_seen_narrower,
     maybe_wrong_specs,
     taken_otherwise,
@@ -256,3 +257,12 @@ def test_a_lens_and_intrinsics_of_two_fields_of_view_are_told(
     assert [f"{fx_px:.0f} by intrinsics" in words for words in said] == [True] * is_told
     assert not [*maybe_wrong_specs(lens, replace(camera, intrinsics=None))]
     assert not [*maybe_wrong_specs(None, camera)]
+
+
+@pytest.mark.parametrize(("ratio", "is_told"), [(1.0, False), (1.06, False), (0.7, True), (1.5, True), (6.0, True)])
+def test_intrinsics_of_another_size_are_told_by_where_their_axis_is(ratio: float, *, is_told: bool) -> None:
+    calibrated = Intrinsics.centred(900.0, 1280, 960).scaled(ratio, ratio)
+    said = [*maybe_of_another_size(Camera(1280, 960, 2.0, 3.8, intrinsics=calibrated))]
+    assert [f"({calibrated.cx_px:.4g}, " in words and "of 1280x960" in words for words in said] == [True] * is_told
+    assert not [*maybe_of_another_size(CAMERA)]
+    assert not [*maybe_of_another_size(replace(CAMERA, intrinsics=None))]
