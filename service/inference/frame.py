@@ -114,8 +114,8 @@ def maybe_of_another_size(camera: Camera) -> Iterator[str]:
     off = max(abs((known.cx_px + 0.5) / width_px - 0.5), abs((known.cy_px + 0.5) / height_px - 0.5))
     if off > MOST_OFF_MIDDLE:
         yield (
-            f"intrinsics put the axis at ({known.cx_px:.4g}, {known.cy_px:.4g}) of {width_px}x{height_px} pixels: "
-            "they are to be those of pictures of the camera's size"
+            f"intrinsics put the axis at ({known.cx_px:.4g}, {known.cy_px:.4g}) of {width_px}x{height_px} pixels, "
+            "far off the middle: were they found at another size, or of too few photographs?"
         )
 
 
