@@ -113,7 +113,8 @@ async def estimate_depth(
 
 
 def _in_a_header(warnings: Sequence[str]) -> str:
-    """As many as there is room for, in the letters that a header may have."""
+    """As many as there is room for, in the letters that a header may have, and what divides them within none."""
+    warnings = [warning.replace(";", ",") for warning in warnings]
     ends = accumulate(len(warning) + len("; ") for warning in warnings)
     told = [warning for warning, end in zip(warnings, ends, strict=True) if end <= MOST_LETTERS]
     more = len(warnings) - len(told)

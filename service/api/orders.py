@@ -145,5 +145,5 @@ def _focused(camera: Camera, focus_distance_m: float | None) -> tuple[Camera, tu
     except ValueError as exc:
         raise BadRequest.at(f"The camera cannot focus at {focus_distance_m:g} m: {exc}.", "focus_distance_m") from exc
     if camera.focal_length_m is None:
-        return focused, ("The lens' focal length is unknown and was taken as far below the focus distance.",)
+        return focused, ("the lens' focal length is unknown and was taken as far below the focus distance",)
     return focused, ()

@@ -178,6 +178,6 @@ def maybe_seen_narrower(camera: Camera) -> Iterator[str]:
     longer = thin_lens.image_distance_in_focal_lengths(camera.focus_distance_m, camera.focal_length_m)
     if longer > VIEW_TOLERANCE:
         yield (
-            "fx_px is that of the lens focused far away; in one that moves as a whole it is "
+            "fx_px is that of the lens focused far away: in one that moves as a whole it is "
             f"{longer:.3g} times that, and points lie as much nearer to the axis: calibrate, or give intrinsics"
         )

@@ -340,6 +340,13 @@ def test_known_depths_tell_where_this_shot_was_focused(bench: TestClient) -> Non
     assert npy(response)[20, 20] == pytest.approx(1.1, rel=0.005)
 
 
+def test_what_divides_warnings_in_a_header_is_in_none(bench: TestClient) -> None:
+    declared = {"Content-Type": "image/jpeg; charset=utf-8"}
+    told = ask(bench, png(grey()), declared, focus_distance_m=1.6).headers["Camind-Warnings"].split("; ")
+    assert told[1] == "declared image/jpeg, charset=utf-8, read as png"
+    assert len(told) == 2
+
+
 def test_so_many_warnings_that_no_proxy_takes_them_in_a_header_are_in_json(bench: TestClient) -> None:
     known = [f"{pixel % 96},{pixel // 2},{0.4 + pixel % 7}" for pixel in range(100)]
     response = ask(bench, format="json", known=known)
