@@ -120,11 +120,18 @@ def maybe_of_another_size(camera: Camera) -> Iterator[str]:
 
 
 def maybe_wrong_specs(lens: Lens | None, camera: Camera) -> Iterator[str]:
-    """A warning where a camera came with both, and its lens specs are of another field of view than its intrinsics.
+    """Warnings where specs are those of a tall picture's height, or of another field of view than the intrinsics are.
 
     k_cam hangs on the same specs. That the lens is longer focused close is allowed for.
     """
-    if lens is None or camera.intrinsics is None:
+    if lens is None:
+        return
+    if lens.sensor_width_px == camera.image_height_px > camera.image_width_px:
+        yield (
+            f"lens.sensor_width_px, {lens.sensor_width_px}, is the images' height: of tall ones it is the sensor's "
+            "short side, and k_cam and metres are wrong by as much"
+        )
+    if camera.intrinsics is None:
         return
     specs_px, seen_px = lens.fx_px(camera.image_width_px), camera.intrinsics.fx_px
     longer = thin_lens.image_distance_in_focal_lengths(camera.focus_distance_m, lens.focal_length_m)

@@ -266,3 +266,14 @@ def test_intrinsics_of_another_size_are_told_by_where_their_axis_is(ratio: float
     assert [f"({calibrated.cx_px:.4g}, " in words and "of 1280x960" in words for words in said] == [True] * is_told
     assert not [*maybe_of_another_size(CAMERA)]
     assert not [*maybe_of_another_size(replace(CAMERA, intrinsics=None))]
+
+
+@pytest.mark.parametrize(
+    ("size_px", "sensor_width_px", "is_told"),
+    [((3072, 4080), 4080, True), ((3072, 4080), 3072, False), ((4080, 3072), 4080, False), ((3000, 3000), 3000, False)],
+)
+def test_a_sensor_s_long_side_as_the_width_of_tall_images_is_told(
+    size_px: tuple[int, int], sensor_width_px: int, *, is_told: bool
+) -> None:
+    said = [*maybe_wrong_specs(Lens(6.81, 1.85, 2.4, sensor_width_px), Camera(*size_px, 0.5, 3.8))]
+    assert ["short side" in words for words in said] == [True] * is_told
