@@ -138,7 +138,7 @@ def maybe_wrong_specs(lens: Lens | None, camera: Camera) -> Iterator[str]:
     if not 1 / SAME_VIEW <= seen_px / specs_px <= SAME_VIEW * longer:
         yield (
             f"fx_px is {specs_px:.0f} by lens and {seen_px:.0f} by intrinsics: is focal_length_mm the 35-mm "
-            "equivalent, or pixel_pitch_um or sensor_width_px wrong? Metres are off by more than that if the lens is"
+            "equivalent, or pixel_pitch_um or sensor_width_px wrong? k_cam is off by as much or more if the lens is"
         )
 
 
