@@ -125,10 +125,10 @@ async function asProblem(error, body) {
 
 /** @param {unknown} body */
 async function noAnswer(body) {
-	const isReadable = !(body instanceof Blob) || (await body.slice(0, 1).arrayBuffer().catch(() => null));
-	if (!isReadable) {
+	for (const one of body instanceof FormData ? body.values() : [body]) {
+		if (!(one instanceof File) || (await one.slice(0, 1).arrayBuffer().catch(() => null))) continue;
 		const detail = "It is a folder, or was changed or moved since it was chosen: choose it again.";
-		return new Problem({ status: 400, title: "The browser cannot read the file.", detail });
+		return new Problem({ status: 400, title: `The browser cannot read ${one.name}.`, detail });
 	}
 	const detail = "Check that it runs and that this device reaches it, then try again.";
 	return new Problem({ status: 0, title: "The service does not answer.", detail });
@@ -199,6 +199,7 @@ export function readDepthHeaders(headers) {
 	return {
 		focusM: Number(headers.get("Camind-Focus-Distance-M")),
 		revision: Number(headers.get("Camind-Camera-Revision")),
+		model: headers.get("Camind-Model") ?? "",
 		warnings: (headers.get("Camind-Warnings") ?? "").split("; ").filter(Boolean),
 	};
 }
@@ -292,10 +293,10 @@ function sendWithProgress(path, { method = "POST", headers = {}, body = null, si
 }
 
 /**
- * Read server-sent events until the stream ends; EventSource cannot send a key.
+ * Read what the service's events hold until the stream ends; EventSource cannot send a key.
  *
  * @param {string} path
- * @param {{signal?: AbortSignal, onEvent: (event: {event: string, data: string}) => void}} options
+ * @param {{signal?: AbortSignal, onEvent: (content: any) => void}} options
  */
 export async function events(path, { signal, onEvent }) {
 	const answer = await request(path, { signal, asks: false, headers: { Accept: "text/event-stream" } });
@@ -306,26 +307,12 @@ export async function events(path, { signal, onEvent }) {
 		for (;;) {
 			const { done, value } = await reader.read();
 			if (done) return;
-			// a line may end in two characters, of which only the first has come
-			text = (text + decoder.decode(value, { stream: true })).replace(/\r\n|\r(?!$)/g, "\n");
-			const blocks = text.split("\n\n");
-			text = /** @type {string} */ (blocks.pop());
-			for (const block of blocks) readEvent(block, onEvent);
+			const lines = (text + decoder.decode(value, { stream: true })).split("\n");
+			text = lines.pop() ?? "";
+			// the service writes each as one line; the others are its ids and signs of life
+			for (const line of lines) if (line.startsWith("data:")) onEvent(JSON.parse(line.slice(5)));
 		}
 	} catch (error) {
 		throw await asProblem(error);
 	}
-}
-
-/** @param {string} block @param {(event: {event: string, data: string}) => void} onEvent */
-function readEvent(block, onEvent) {
-	/** @type {string[]} */
-	const data = [];
-	let event = "message";
-	for (const line of block.split("\n")) {
-		const [, name, value] = /^([^:]*):? ?(.*)$/s.exec(line) ?? [];
-		if (name === "event") event = value;
-		if (name === "data") data.push(value);
-	}
-	if (data.length > 0) onEvent({ event, data: data.join("\n") });
 }

@@ -1,7 +1,6 @@
 /** The calibration, step by step: print a sheet, photograph it, wait, and accept what was found. */
 
 import { Problem, events, getJson, problemOf, storedKey, upload } from "./api.js";
-import { stay } from "./cameras.js";
 import { Ended, Running } from "./job_step.js";
 import { toMetres, when } from "./numbers.js";
 import { Photographs, useLooks } from "./photo_step.js";
@@ -19,6 +18,9 @@ const FINAL = new Set(["succeeded", "failed", "cancelled"]);
 const TONES = { succeeded: "good", failed: "bad", running: "warn", queued: "warn" };
 
 /** @typedef {import("./photo_step.js").Photo} Photo */
+
+/** Ask before the page goes: its own, which the cameras' form does not take away. @param {Event} event */
+const stay = (event) => event.preventDefault();
 
 /** @param {import("./app.js").ViewProps} props */
 export function CalibrateView({ shown, cameras, camera, reloadCameras, go, announce }) {
@@ -259,8 +261,7 @@ function useJob(job, attempt, setJob, setProblem, onEnd) {
 				try {
 					await events(`calibrations/${live}/events`, {
 						signal: stop.signal,
-						onEvent: ({ data }) => {
-							const now = JSON.parse(data);
+						onEvent: (now) => {
 							setJob(now);
 							setProblem((old) => (old === met ? null : old));
 							if (FINAL.has(now.state)) {

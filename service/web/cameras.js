@@ -16,7 +16,7 @@ const SOURCES = { given: "given", lens: "from lens specs", calibration: "calibra
 /** @typedef {{kind: "none"} | {kind: "read", name: string} | {kind: "new"} | {kind: "edit", camera: any}} Open */
 
 /** Ask before the page goes. @param {Event} event */
-export const stay = (event) => event.preventDefault();
+const stay = (event) => event.preventDefault();
 
 /** @param {import("./app.js").ViewProps} props */
 export function CamerasView({ shown, cameras, lacksCameras, camera, reloadCameras, go, announce }) {

@@ -222,7 +222,7 @@ function Outliers({ outliers }) {
 function Accept({ job, cameras, isVague, onAccepted, onDiscard, onAgain, go }) {
 	const [name, setName] = useState(job.camera);
 	const [problem, setProblem] = useProblem();
-	const there = cameras?.find((camera) => camera.name === name);
+	const there = cameras?.find((camera) => camera.name === name.trim());
 	const fault = problem?.errors.find(({ pointer }) => pointer === "#/camera")?.detail ?? "";
 
 	useEffect(() => setName(job.camera), [job.id]);
@@ -254,7 +254,7 @@ function Accept({ job, cameras, isVague, onAccepted, onDiscard, onAgain, go }) {
 			<${ProblemBox} problem=${fault ? null : problem} />
 			<${TextField}
 				...${{ id: "accept-name", label: "Store it as camera", list: "camera-names", value: name, onInput: setName, fault }}
-				hint=${there ? `It becomes revision ${there.revision + 1} of ${name}; revision ${there.revision} is kept.` : "A new camera."}
+				hint=${there ? `It becomes revision ${there.revision + 1} of ${there.name}; revision ${there.revision} is kept.` : "A new camera."}
 			/>
 			<div class="row">
 				${isVague && html`<button type="button" class="primary" onClick=${onAgain}>Back to the photographs</button>`}

@@ -229,6 +229,9 @@ function statusOf({ look, problem }, isLooking) {
 	return look.warnings.length > 0 || look.exposure !== "good" ? ["warn", "found"] : ["good", "found"];
 }
 
+// one after the other: forty opened at a time may be more than a phone has
+let before = Promise.resolve();
+
 /** The photograph upright and small, with the circles over it. @param {{file: File, look: any | null}} props */
 function Thumb({ file, look }) {
 	const canvas = useRef(/** @type {?HTMLCanvasElement} */ (null));
@@ -236,12 +239,13 @@ function Thumb({ file, look }) {
 	useEffect(() => {
 		let made = /** @type {?ImageBitmap} */ (null);
 		let isGone = false;
-		readShown(file, THUMB_PX, (shown) =>
-			createImageBitmap(shown, { resizeWidth: THUMB_PX, resizeQuality: "medium" }).catch(() => null),
-		).then((found) => {
-			made = found;
-			if (isGone) found?.close();
-			else setBitmap(found);
+		before = before.then(async () => {
+			if (isGone) return;
+			made = await readShown(file, THUMB_PX, (shown) =>
+				createImageBitmap(shown, { resizeWidth: THUMB_PX, resizeQuality: "medium" }).catch(() => null),
+			);
+			if (isGone) made?.close();
+			else setBitmap(made);
 		});
 		return () => {
 			isGone = true;

@@ -5,6 +5,7 @@ import re
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
 import cv2
@@ -22,6 +23,15 @@ LONG_MS = 120_000
 GREY = """(canvas) => {
   const {data} = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
   return Array.from({length: data.length / 4}, (_, at) => (data[4 * at] + data[4 * at + 1] + data[4 * at + 2]) / 3);
+}"""
+# photographs that are decoded at the same time
+COUNT_OPENED = """() => {
+  const open = createImageBitmap;
+  let opened = window.mostOpened = 0;
+  window.createImageBitmap = (...about) => {
+    window.mostOpened = Math.max(window.mostOpened, ++opened);
+    return open(...about).finally(() => opened--);
+  };
 }"""
 K_CAM = {
     "image_width_px": CAMERA.width_px,
@@ -104,6 +114,7 @@ def test_every_photograph_says_at_once_what_it_shows(
     assert served.add(camera) == 201
     to_photographs(page, name)
     expect(page.get_by_text("Begin with one")).to_be_visible()
+    page.evaluate(COUNT_OPENED)
     drop(page, photographs[0], photographs[-1])
     shown = page.get_by_role("list", name="Photographs").get_by_role("listitem")
     near = shown.filter(has_text=photographs[0].name)
@@ -118,6 +129,7 @@ def test_every_photograph_says_at_once_what_it_shows(
     expect(page.get_by_role("img", name="Blur of each photograph")).to_be_visible()
     # said where it is read, and aloud
     expect(page.get_by_text(re.compile(r"Next: one at [\d.]+\S[\d.]+ m, tilted by 15 to 25 degrees"))).to_have_count(2)
+    assert page.evaluate("window.mostOpened") == 1
     assert barriers(page) == []
     nothing.get_by_role("button", name="Remove nothing.png").press("Enter")
     expect(shown).to_have_count(1)
@@ -136,7 +148,11 @@ def test_the_same_photograph_again_is_no_other(page: Page, photographs: list[Pat
     expect(page.get_by_text("1 photograph was there already.")).to_have_count(2)  # seen, and said aloud
     drop(page, photographs[0], role="focused")
     expect(shown).to_have_count(3)
-    # they would be lost where the page is left by mistake
+    # they would be lost where the page is left by mistake, also after a camera was looked at
+    page.get_by_role("tab", name="Cameras").click()
+    page.get_by_role("button", name="New camera").click()
+    page.get_by_role("button", name="Cancel").click()
+    page.get_by_role("tab", name="Calibrate").click()
     leaving: list[str] = []
 
     def stay(dialog: Dialog) -> None:
@@ -286,12 +302,15 @@ def test_photographs_that_a_lost_connection_left_out_are_looked_at_together(
 def test_a_file_that_is_no_photograph_is_told(
     page: Page, tmp_path: Path, name: str, expected_errors: list[str]
 ) -> None:
-    expected_errors.append("status of 4")
+    expected_errors.extend(["status of 4", "ERR_UPLOAD_FILE_CHANGED"])
     file = tmp_path / "notes.jpg"
     file.write_text("no picture")
     to_photographs(page, name)
     drop(page, file)
     expect(page.get_by_text("not readable")).to_be_visible()
+    file.write_text("no picture either")
+    page.get_by_role("button", name="Start the calibration").click()
+    expect(page.get_by_text("The browser cannot read notes.jpg.")).to_be_visible()
 
 
 def test_a_set_becomes_a_camera(
@@ -300,8 +319,10 @@ def test_a_set_becomes_a_camera(
     served: Server,
     photographs: list[Path],
     name: str,
+    d200: dict[str, Any],
     barriers: Callable[[Page], list[str]],
 ) -> None:
+    served.add(d200)
     to_photographs(page, name, ruler_mm="99")
     drop(page, *photographs)
     page.get_by_label("Focus distance (m)").fill("0.495")
@@ -324,6 +345,10 @@ def test_a_set_becomes_a_camera(
     expect(page.get_by_text("1 of 4 photographs were of no use")).to_be_visible()
     assert served.ask("GET", f"/cameras/{name}").status == 404
     assert barriers(page) == []
+    stored_as = page.get_by_label("Store it as camera")
+    stored_as.fill(f"{d200['name']} ")
+    expect(stored_as).to_have_accessible_description(re.compile(f"^It becomes revision .* of {d200['name']}; revision"))
+    stored_as.fill(name)
     page.get_by_role("button", name="Accept as a new camera").click()
     expect(page.get_by_role("status")).to_have_text(f"Stored as revision 1 of camera {name}.")
     camera = served.ask("GET", f"/cameras/{name}").json()
