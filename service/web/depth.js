@@ -183,7 +183,9 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 		announce("Sending the photograph.");
 		let isHeld = true; // the answer before
 		try {
-			const answer = await upload(`${depthPath({ ...ask, format: "npz" })}&longest_px=${MOST_PX}`, {
+			// a phone shows little more, and four times as much would take four times as long to come
+			const longestPx = Math.min(MOST_PX, 2 * screen.width);
+			const answer = await upload(`${depthPath({ ...ask, format: "npz" })}&longest_px=${longestPx}`, {
 				body: sent,
 				headers: { "Content-Type": mediaTypeOf(sent) },
 				// a Blob: it stays outside the page, and the worker takes its arrays out one by one
@@ -206,7 +208,6 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 				facts,
 				...told,
 				timings: readTimings(answer.headers.get("Server-Timing") ?? ""),
-				model: answer.headers.get("Camind-Model") ?? "",
 			});
 			setReading(kept.current && again);
 			setMarks((before) => [...before]);
@@ -389,7 +390,7 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 							/>
 							${result &&
 							html`<${Colours} look=${look} facts=${result.facts} onLook=${setLook} />
-								<${Exports} key=${result.model + JSON.stringify(result.asked)} ...${{ result, announce }} onChanged=${reloadCameras} />
+								<${Exports} key=${JSON.stringify(result.asked)} ...${{ result, announce }} onChanged=${again} />
 								<${Timings} timings=${result.timings} model=${result.model} />`}
 						</div>`}
 					</div>`}

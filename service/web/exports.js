@@ -9,7 +9,7 @@ import { Choice } from "./text_field.js";
 import { html, useState } from "./vendor/preact.js";
 
 /** @param {{result: import("./depth.js").Result, announce: (text: string) => void, onChanged: () => void}} props */
-export function Exports({ result: { asked, file, revision, warnings }, announce, onChanged }) {
+export function Exports({ result: { asked, file, revision, model, warnings }, announce, onChanged }) {
 	const [format, setFormat] = useState("png");
 	const [isBusy, setIsBusy] = useState(false);
 	const [problem, setProblem] = useProblem();
@@ -36,15 +36,15 @@ export function Exports({ result: { asked, file, revision, warnings }, announce,
 		}
 	}
 
-	/** The service keeps no photograph: it is sent again. @returns {Promise<{body: Blob | null, told: string[]}>} no body where it is another camera's now */
+	/** The service keeps no photograph: it is sent again. @returns {Promise<{body: Blob | null, told: string[]}>} no body where it is another camera's or model's now */
 	async function ask() {
 		const reply = await request(path, { method: "POST", body: file, headers: { "Content-Type": mediaType } });
 		const now = readDepthHeaders(reply.headers);
-		if (now.revision !== revision) {
+		if (now.revision !== revision || now.model !== model) {
 			reply.body?.cancel();
 			onChanged();
-			const words = `camera ${asked.camera} was changed to revision ${now.revision}: nothing is downloaded`;
-			return { body: null, told: [`${words}, the photograph is read again`] };
+			const words = now.model === model ? `camera ${asked.camera} was changed to revision ${now.revision}` : `the model is ${now.model} now`;
+			return { body: null, told: [`${words}: nothing is downloaded, the photograph is read again`] };
 		}
 		return { body: await readBody(reply, "blob"), told: now.warnings.filter((text) => !warnings.includes(text)) };
 	}

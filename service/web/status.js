@@ -105,7 +105,7 @@ async function lookedAt(before, signal) {
 	if (ready instanceof Problem && ready.status === 0) {
 		return { ...before, ready, samples: ready, at: new Date() };
 	}
-	const isModelKnown = before.model !== null && !(before.model instanceof Problem);
+	const isModelKnown = before.model?.manifest?.name === (ready?.model ?? "");
 	const model =
 		isModelKnown || isRefused(before.model)
 			? before.model

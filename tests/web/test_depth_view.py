@@ -703,7 +703,7 @@ def test_a_file_that_was_changed_since_it_was_chosen_is_told(
     stage(opened)
     file.write_bytes(b"another")
     opened.get_by_role("button", name="Download").click()
-    expect(opened.get_by_role("alert").filter(visible=True)).to_contain_text("The browser cannot read the file.")
+    expect(opened.get_by_role("alert").filter(visible=True)).to_contain_text("The browser cannot read photo.jpg.")
 
 
 def test_progress_has_room_on_a_phone(opened: Page) -> None:
@@ -781,7 +781,8 @@ def test_a_phone_takes_the_photograph_and_fingers_read_it(
         with page.expect_file_chooser() as asked:
             page.get_by_role("button", name="Take one").tap()
         assert asked.value.element.get_attribute("capture") == "environment"
-        asked.value.set_files(PHOTOGRAPH)
+        with page.expect_request(re.compile(r"&longest_px=780$")):
+            asked.value.set_files(PHOTOGRAPH)
         picture, known = stage(page), maps()
         assert page.evaluate(OVERFLOW) <= 0
         for u, v in ((100, 300), (520, 180)):

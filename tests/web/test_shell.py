@@ -293,19 +293,37 @@ def test_a_quota_says_when_to_come_back(browser: Browser, keyed: Keyed) -> None:
         expect(problem).to_contain_text("Request ")
 
 
-def test_a_service_that_stops_is_told_apart_from_one_that_refuses(
-    browser: Browser, tmp_path: Path, tiny_model_dir: Path
+def test_a_service_that_stops_is_told_apart_from_one_that_refuses_and_from_one_with_another_model(
+    browser: Browser, tmp_path: Path, tiny_model_dir: Path, d200: dict[str, Any]
 ) -> None:
     with (
         serving(tmp_path / "data", "--model", tiny_model_dir) as server,
         watched(browser, server.url, ["ERR_CONNECTION_REFUSED", "status of 503"]) as page,
     ):
-        page.goto("#status")
+        server.add(d200)
+        page.goto("#depth/d200")
+        with page.expect_file_chooser() as chooser:
+            page.get_by_role("button", name="Choose a photograph").click()
+        chooser.value.set_files(ROOT / "docs" / "pictures" / "coffee.jpg")
+        expect(page.get_by_role("application", name="Depth of the photograph")).to_be_visible()
+        page.get_by_role("tab", name="Status").click()
         expect(page.get_by_text("Ready", exact=True)).to_be_visible()
         server.stop(signal.SIGTERM)
         expect(page.get_by_text("No answer", exact=True)).to_be_visible(timeout=20_000)
         expect(page.get_by_role("alert").filter(visible=True)).to_contain_text("The service does not answer.")
         expect(page.get_by_role("status")).to_contain_text("The service is not ready.")
+        with serving(tmp_path / "data", "--port", str(server.port)) as newer:
+            model = newer.ask("GET", "/model").json()["manifest"]["name"]
+            expect(page.get_by_role("region", name="Model").locator(".badge")).to_have_text(model)
+            page.get_by_role("tab", name="Depth").click()
+            downloads: list[str] = []
+            page.on("download", lambda download: downloads.append(download.suggested_filename))
+            with page.expect_response(lambda answer: "format=npz" in answer.url):
+                page.get_by_role("button", name="Download").click()
+            told = page.get_by_text(f"The model is {model} now: nothing is downloaded, the photograph is read again")
+            expect(told).to_be_visible()
+            expect(page.locator("details").filter(has_text="The service took")).to_contain_text(model)
+            assert downloads == []
 
 
 def test_the_api_module_tells_problems_apart(page: Page, expected_errors: list[str]) -> None:
