@@ -1,6 +1,6 @@
-/** Focus that goes with its element is given to what one reaches before, or to the tab in front. */
+/** Focus that goes with its element is given to what one reaches before, or to the tab in front where its view has gone. */
 
-const STOPS = "main :is(a, button, input, select, summary, [tabindex='0'])";
+const STOPS = "a, button, input, select, summary, [tabindex='0']";
 const WAIT_MS = 100; // the page goes first
 
 /** @type {any} */
@@ -9,8 +9,8 @@ let last = null;
 let reached = [];
 
 document.addEventListener("focusin", ({ target }) => {
-	const all = [...document.querySelectorAll(STOPS)];
 	last = target;
+	const all = [...(last.closest("main > section")?.querySelectorAll(STOPS) ?? [])];
 	reached = all.slice(0, all.indexOf(last) + 1);
 });
 

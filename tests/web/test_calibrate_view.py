@@ -355,6 +355,8 @@ def test_a_set_becomes_a_camera(
     assert (camera["source"], camera["k_cam_px"]) == ("calibration", pytest.approx(found["value"]))
     page.get_by_role("button", name="See the camera").click()
     expect(page.get_by_role("heading", name=name)).to_be_visible()
+    page.get_by_role("button", name="Measure depth").click()
+    expect(page.get_by_role("tab", name="Depth")).to_be_focused()
 
 
 def test_one_that_found_nothing_says_why_and_goes_back(page: Page, photographs: list[Path], name: str) -> None:
