@@ -195,7 +195,7 @@ function PhotoCard({ photo, isLooking, hasPartner: partner, onRole, onAgain, onR
 			</div>
 			${problem &&
 			html`<p class="fault">${problem.title} ${problem.detail}</p>
-				${!isLooking && html`<button onClick=${onAgain}>Look again</button>`}`}
+				${!isLooking && problem.isPassing && html`<button onClick=${onAgain}>Look again</button>`}`}
 			${look?.found &&
 			html`<dl class="facts">
 				<dt>Blur</dt><dd>${measure(look.blur_px, " px")}</dd>

@@ -308,6 +308,7 @@ def test_a_file_that_is_no_photograph_is_told(
     to_photographs(page, name)
     drop(page, file)
     expect(page.get_by_text("not readable")).to_be_visible()
+    expect(page.get_by_role("button", name="Look again")).to_have_count(0)
     file.write_text("no picture either")
     page.get_by_role("button", name="Start the calibration").click()
     expect(page.get_by_text("The browser cannot read notes.jpg.")).to_be_visible()

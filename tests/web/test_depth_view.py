@@ -785,6 +785,7 @@ def test_a_phone_takes_the_photograph_and_fingers_read_it(
             asked.value.set_files(PHOTOGRAPH)
         picture, known = stage(page), maps()
         assert page.evaluate(OVERFLOW) <= 0
+        expect(page.get_by_label("Focus distance of this shot")).to_have_css("font-size", "16px")  # iOS magnifies less
         for u, v in ((100, 300), (520, 180)):
             picture.tap(position=place_of(picture, u, v))
             eventually(page, partial(is_read, u, v))
