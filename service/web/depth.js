@@ -496,7 +496,7 @@ function Progress({ phase, onCancel }) {
 
 /** @param {string} text @returns {"camera" | "focus" | "result"} beside what it should be read */
 function placeOfWarning(text) {
-	if (text.includes("focal length")) return "focus";
+	if (text.includes("focal length is")) return "focus";
 	return text.includes("k_cam_px") ? "camera" : "result";
 }
 

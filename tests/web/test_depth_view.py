@@ -818,6 +818,8 @@ def test_without_a_focal_length_there_are_depths_but_no_space(
     give(opened, kind="paste")
     stage(opened)
     expect(opened.get_by_text("Needs the camera's focal length")).to_be_visible()
+    # not beside the focus distance, which it says nothing of
+    expect(opened.locator(".depth-side-panel .warnings")).to_contain_text("The camera has no focal length in pixels")
     opened.get_by_role("tab", name="3D").click()
     expect(opened.get_by_text("Points in space need the camera's focal length")).to_be_visible()
 
