@@ -1,6 +1,7 @@
 """``/cameras``: preview, register, read, replace, delete, list, and a camera's revisions and blur curve."""
 
 import re
+from dataclasses import replace
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
@@ -36,6 +37,7 @@ from service.inference.drafting import Draft, draft_camera
 from service.inference.exif import read_exif
 from service.inference.frame import AS_INFINITY_M
 from service.inference.headers import read_header
+from service.inference.making import noted_making
 from service.optics import thin_lens
 from service.optics.camera import RANGE_BLUR_ERROR_PX, Camera
 from service.storage.cameras import CameraRecord
@@ -235,7 +237,8 @@ def read_curve(
 
 def _drafted(data: bytes) -> Draft:
     header = read_header(data)
-    return draft_camera(read_exif(header.exif), header.width_px, header.height_px)
+    draft = draft_camera(read_exif(header.exif), header.width_px, header.height_px)
+    return replace(draft, warnings=(*draft.warnings, *noted_making(data, header)))
 
 
 def _answer(record: CameraRecord, response: Response) -> CameraRead:

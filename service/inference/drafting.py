@@ -170,6 +170,11 @@ def _sensor_width_mm(exif: Exif, sensor_width_px: int | None, aspect: float, war
             f"the sensor is taken as {width_mm:.3g} mm wide, where the EXIF or a list of cameras also says {others}: "
             "check lens.pixel_pitch_um"
         )
+    if len(found) == 1 and not told:
+        warnings.append(
+            f"the sensor is taken as {width_mm:.3g} mm wide by the pixel pitch in its EXIF alone, which stays as it "
+            "was where a program made the picture smaller: check lens.pixel_pitch_um"
+        )
     warnings.extend(told)
     return width_mm
 

@@ -14,18 +14,22 @@ from typing import Any, Literal
 
 from service.errors import InvalidImage, UnsupportedKind
 from service.inference.heic import curve_of_primary, exif_item, is_animated, kind_of, primary_picture
-from service.inference.tone_curve import CURVES, SRGB, curve_of_profile, unpacked_profile
+from service.inference.tone_curve import CURVES, LINEAR, SRGB, curve_of_profile, unpacked_profile
 
 Kind = Literal["jpeg", "png", "tiff", "webp", "heic", "avif", "raw"]
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-PNG_READ = frozenset({b"IHDR", b"eXIf", b"acTL", b"cICP", b"iCCP"})
+PNG_READ = frozenset({b"IHDR", b"eXIf", b"acTL", b"cICP", b"iCCP", b"sRGB", b"gAMA", b"iTXt"})
+PNG_LINEAR = struct.pack(">I", 100_000)  # gamma 1
+PNG_PALETTE = 3
+PNG_XMP = b"XML:com.adobe.xmp\x00"
 PNG_ANCILLARY = 0x20  # of a chunk's first letter: no part of the picture (ISO/IEC 15948, 5.4)
 EXIF_SIGNATURE = b"Exif\x00\x00"
 XMP_SIGNATURE = b"http://ns.adobe.com/xap/1.0/\x00"
 ICC_SIGNATURE, ICC_NUMBERING = b"ICC_PROFILE\x00", 2
 # of RAF, ORF, RW2, X3F and CR3
 OTHER_RAW = re.compile(rb"FUJIFILMCCD-RAW|IIR[OS]|MMOR|IIU\0|FOVb|....ftypcrx ", re.DOTALL)
+BIG_TIFF = (b"II+\x00", b"MM\x00+")
 JPEG_MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
 JPEG_FILL = re.compile(rb"\xff*(?=\xff)")
 JPEG_END, JPEG_SCAN, JPEG_STEPS, JPEG_APP1, JPEG_APP2 = 0xD9, 0xDA, 0xDB, 0xE1, 0xE2
@@ -39,15 +43,16 @@ TIFF_PLANAR = 284
 TIFF_PHOTOMETRIC, TIFF_SUB_DIRECTORIES, TIFF_DNG_VERSION = 262, 330, 50706
 # photometric interpretations of sensor values: a filter array, and the same after demosaicing
 TIFF_SENSOR = frozenset({32803, 34892})
+TIFF_PALETTE = 3
 CR2_MARK = b"CR"
 MOST_DIRECTORIES = 16
 TIFF_TYPES = {1: "B", 3: "H", 4: "I", 13: "I"}
 TIFF_TYPE_BYTES = dict(enumerate((0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4, 0, 0, 8, 8, 8)))
 # with those that are no whole numbers: a rational is two
-TIFF_NUMBERS = {**TIFF_TYPES, 5: "II", 11: "f", 12: "d"}
+TIFF_NUMBERS = {**TIFF_TYPES, 5: "II", 10: "ii", 11: "f", 12: "d"}
 INFINITY = 2**32 - 1  # above a fraction
 TIFF_TEXT, TIFF_MOST_TEXT = 2, 256
-EXIF_DIRECTORY, TIFF_PROFILE = 34665, 34675
+EXIF_DIRECTORY, TIFF_PROFILE, TIFF_XMP = 34665, 34675, 700
 TIFF_MAX_VALUES = 100_000
 TIFF_MAX_ENTRIES = 4_096
 TIFF_TILE_SIZE = (322, 323)
@@ -62,7 +67,8 @@ class Header:
     """Stored size in pixels, before orientation (EXIF, 1..8) is applied; ``exif`` is the EXIF, without a signature.
 
     Of a tiff or raw file that is the file. ``has_more``: other pages or frames follow. ``curve``: what its values have,
-    by H.273's number. ``quality``: of a jpeg, 1 to 100, as most programs count it. ``xmp``: of a jpeg.
+    by H.273's number. ``quality``: of a jpeg, 1 to 100, as most programs count it. ``xmp``: not of heic, avif and raw.
+    ``has_few_colours``: of a palette, or of less than 8 bits.
     """
 
     kind: Kind
@@ -75,6 +81,7 @@ class Header:
     curve: int = SRGB
     quality: float | None = None
     xmp: bytes = b""
+    has_few_colours: bool = False
 
     @property
     def other_curve(self) -> str | None:
@@ -103,6 +110,8 @@ def read_header(data: bytes) -> Header:
     if kind is None:
         if OTHER_RAW.match(data):
             raise UnsupportedKind("Raw files of this kind are not read: convert it to DNG, or send the camera's JPEG.")
+        if data[:4] in BIG_TIFF:
+            raise UnsupportedKind("A BigTIFF is not read: store it as a TIFF of the usual form.")
         raise UnsupportedKind(
             "This is not a JPEG, PNG, TIFF, WebP, HEIC, AVIF or DNG file: send a photograph of one of these kinds."
         )
@@ -132,9 +141,9 @@ def _jpeg(data: bytes) -> Header:
             height, width = struct.unpack_from(">HH", payload, 1)
             size = (width, height)
         elif marker == JPEG_APP1 and payload.startswith(EXIF_SIGNATURE):
-            exif = payload[len(EXIF_SIGNATURE) :]
+            exif = exif or payload[len(EXIF_SIGNATURE) :]
         elif marker == JPEG_APP1 and payload.startswith(XMP_SIGNATURE):
-            xmp = payload
+            xmp = xmp or payload
         elif marker == JPEG_APP2 and payload.startswith(ICC_SIGNATURE):
             profile = profile or payload[len(ICC_SIGNATURE) + ICC_NUMBERING :]
         elif marker == JPEG_STEPS and quality is None:
@@ -177,21 +186,27 @@ def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _png(data: bytes) -> Header:
-    size, frames = (0, 0), 1
-    exif = profile = coded = b""
+    found: dict[bytes, bytes] = {}
+    xmp = b""
     for name, payload in _png_chunks(data):
-        if name == b"IHDR":
-            size = struct.unpack_from(">II", payload)
-        elif name == b"eXIf":
-            exif = payload
-        elif name == b"acTL":
-            frames = int.from_bytes(payload[:4], "big")
-        elif name == b"iCCP":
-            profile = payload
-        elif name == b"cICP":
-            coded = payload[1:2]
-    curve = int.from_bytes(coded, "big") if coded else curve_of_profile(unpacked_profile(profile))
-    return Header("png", *size, _exif_orientation(exif), exif=exif, has_more=frames > 1, curve=curve)
+        if name == b"iTXt":
+            xmp = xmp or (payload if payload.startswith(PNG_XMP) else b"")
+        else:
+            found[name] = payload
+    width, height, bits, colours = struct.unpack_from(">IIBB", found.get(b"IHDR", b"").ljust(10, b"\0"))
+    exif, frames = found.get(b"eXIf", b""), int.from_bytes(found.get(b"acTL", b"")[:4], "big")
+    orientation, has_more = _exif_orientation(exif), frames > 1
+    few, curve = bits < 8 or colours == PNG_PALETTE, _png_curve(found)
+    return Header("png", width, height, orientation, None, exif, has_more, curve, xmp=xmp, has_few_colours=few)
+
+
+def _png_curve(found: dict[bytes, bytes]) -> int:
+    """By the part that counts most (W3C PNG, third edition, 4.3)."""
+    if coded := found.get(b"cICP", b"")[1:2]:
+        return coded[0]
+    if b"iCCP" in found:
+        return curve_of_profile(unpacked_profile(found[b"iCCP"]))
+    return LINEAR if b"sRGB" not in found and found.get(b"gAMA") == PNG_LINEAR else SRGB
 
 
 def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
@@ -227,7 +242,7 @@ def _webp(data: bytes) -> Header:
     if length + 8 > len(data):
         raise InvalidImage.cut_off("webp")
     size: tuple[int, int] | None = None
-    exif = profile = b""
+    exif = profile = xmp = b""
     frames = 0
     at = 12
     for _ in range(MOST_PARTS):
@@ -240,13 +255,15 @@ def _webp(data: bytes) -> Header:
             exif = data[at + 8 : at + 8 + chunk].removeprefix(EXIF_SIGNATURE)
         elif name == b"ICCP":
             profile = data[at + 8 : at + 8 + chunk]
+        elif name == b"XMP ":
+            xmp = data[at + 8 : at + 8 + chunk]
         at += 8 + chunk + chunk % 2
     else:
         raise _too_many_parts("webp")
     if size is None:
         raise InvalidImage("The webp file holds no picture.")
     curve = curve_of_profile(profile)
-    return Header("webp", *size, _exif_orientation(exif), exif=exif, has_more=frames > 1, curve=curve)
+    return Header("webp", *size, _exif_orientation(exif), exif=exif, has_more=frames > 1, curve=curve, xmp=xmp)
 
 
 def _webp_size(name: bytes, payload: bytes) -> tuple[int, int] | None:
@@ -269,18 +286,24 @@ def _tiff(data: bytes) -> Header:
         return Header("raw", *sensor, directory.orientation(), exif=data)
     if 3 in directory.values(TIFF_SAMPLE_FORMAT):
         raise UnsupportedKind("A tiff of floating-point numbers is no photograph: send 8 or 16 bits, sRGB.")
-    if not set(directory.values(TIFF_BITS)) <= {8, 16}:
+    if not {*(directory.values(TIFF_BITS) or [1])} <= {8, 16}:
         raise UnsupportedKind("A tiff must have 8 or 16 bits a channel.")
     directory.require_own_bytes()
     _require_usual(directory)
     _require_tiles(directory)
     at = directory.offset_of(TIFF_ORIENTATION)
     has_more, curve = _has_more_pages(data, directory), curve_of_profile(directory.bytes_of(TIFF_PROFILE))
-    return Header("tiff", *directory.size, directory.orientation(), at, data, has_more, curve)
+    xmp, few = directory.bytes_of(TIFF_XMP), TIFF_PALETTE in directory.values(TIFF_PHOTOMETRIC)
+    size, orientation = directory.size, directory.orientation()
+    return Header("tiff", *size, orientation, at, data, has_more, curve, xmp=xmp, has_few_colours=few)
 
 
 def _require_usual(directory: "TiffDirectory") -> None:
-    """What the decoder takes for something else in 16 bits: colours one after the other, and white as 0."""
+    """What the decoder takes for something else: a small copy for its picture; in 16 bits colours one after the other,
+    and white as 0.
+    """
+    if _is_small_copy(directory):
+        raise UnsupportedKind("The first picture of this tiff is a small copy of another: store the large one alone.")
     if 16 not in directory.values(TIFF_BITS):
         return
     if 2 in directory.values(TIFF_PLANAR) and len(directory.values(TIFF_BITS)) > 1:
@@ -293,9 +316,13 @@ def _has_more_pages(data: bytes, first: "TiffDirectory") -> bool:
     """Whether pages follow; a smaller copy of the first is none."""
     try:
         pages = [TiffDirectory(data, start) for start in first.following(MOST_DIRECTORIES)]
-        return not all(1 & next(iter(page.values(TIFF_NEW_SUBFILE)), 0) for page in pages)
+        return not all(_is_small_copy(page) for page in pages)
     except (struct.error, InvalidImage):
         return False
+
+
+def _is_small_copy(page: "TiffDirectory") -> bool:
+    return bool(1 & next(iter(page.values(TIFF_NEW_SUBFILE)), 0))
 
 
 def _require_tiles(directory: "TiffDirectory") -> None:

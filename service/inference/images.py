@@ -45,6 +45,8 @@ SUFFIXES = frozenset(
     {
         ".jpg",
         ".jpeg",
+        ".jfif",
+        ".mpo",
         ".png",
         ".tif",
         ".tiff",
@@ -134,7 +136,9 @@ def read_photograph(data: bytes, media_type: str | None = None, limits: ImageLim
     if header.quality is not None and round(header.quality) < LEAST_QUALITY:
         said = f"a jpeg of quality {header.quality:.0f}, below the {LEAST_QUALITY} that the model was trained on"
         warnings += (f"{said}: send what the camera stored",)
-    warnings += tuple(signs_of_making(header, stored))
+    if header.has_few_colours:
+        warnings += ("it has a palette's few colours, whose steps are taken for edges: send what the camera stored",)
+    warnings += tuple(signs_of_making(data, header, stored))
     return Photograph(turned(stored, orientation), kind, orientation, warnings, read_exif(header.exif))
 
 
@@ -232,10 +236,10 @@ def _eight_bits(pixels: NDArray[Any]) -> tuple[NDArray[np.uint8], tuple[str, ...
 
 
 def _bits(brightest: int) -> int:
-    """How many there are to a pixel, where an industrial camera's 10 or 12 stand in 16 as they are."""
+    """How many there are to a pixel, where an industrial camera's 10, 12 or 14 stand in 16 as they are."""
     if 2**8 <= brightest < 2**10:  # what is darker may be 12 bits of a lens cap
         return 10
-    return 12 if 0 < brightest < 2**12 else 16
+    return next((bits for bits in (12, 14) if 0 < brightest < 2**bits), 16)
 
 
 def _stored_pixels(decoded: NDArray[np.uint8], header: Header) -> NDArray[np.uint8]:

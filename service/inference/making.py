@@ -24,22 +24,35 @@ ALIKE, CLEARLY = 0.9, 0.1
 CROPPED, APPLIED = (re.compile(rb"crs:" + name + rb"(=[\'\"]|>)True", re.I) for name in (b"HasCrop", b"AlreadyApplied"))
 # of Google's cameras, and of others as theirs do
 RENDERINGS = {b"GPano:ProjectionType": "a panorama", b"SpecialType-PORTRAIT": "a portrait mode"}
+SAMSUNG_PORTRAIT = b"Shot_DepthMap_"  # DualShot and SingeShot: a part behind the picture, with what it was blurred by
 ADVICE = "send the whole frame, for a part that is taken for a small copy gives wrong metres"
 
 Grey = NDArray[np.uint8]
 
 
-def signs_of_making(header: Header, stored: NDArray[np.uint8]) -> Iterator[str]:
+def signs_of_making(data: bytes, header: Header, stored: NDArray[np.uint8]) -> Iterator[str]:
     """Warnings where the stored frame [h, w, 3] RGB is a part of what was taken, or was computed."""
-    for mark, rendering in RENDERINGS.items():
-        if mark in header.xmp:
-            yield f"its XMP says {rendering}: its blur may be computed, and no lens'"
-    if CROPPED.search(header.xmp) and APPLIED.search(header.xmp):
-        yield f"its XMP says that it was cropped: {ADVICE}"
+    yield from noted_making(data, header)
+    if _is_noted_crop(header):
         return
     thumbnail = _thumbnail(header)
     if thumbnail is not None and _shows_more(thumbnail, stored):
         yield f"the thumbnail in its EXIF shows more than it does, so it was cropped: {ADVICE}"
+
+
+def noted_making(data: bytes, header: Header) -> Iterator[str]:
+    """Those of these warnings that need no pixels."""
+    for mark, rendering in RENDERINGS.items():
+        if mark in header.xmp:
+            yield f"its XMP says {rendering}: its blur may be computed, and no lens'"
+    if header.kind in ("jpeg", "heic") and SAMSUNG_PORTRAIT in data:
+        yield "it holds the depth map of a portrait mode: its blur may be computed, and no lens'"
+    if _is_noted_crop(header):
+        yield f"its XMP says that it was cropped: {ADVICE}"
+
+
+def _is_noted_crop(header: Header) -> bool:
+    return bool(CROPPED.search(header.xmp) and APPLIED.search(header.xmp))
 
 
 def _thumbnail(header: Header) -> Grey | None:

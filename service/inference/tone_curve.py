@@ -11,9 +11,10 @@ CURVES = {8: "linear light", 16: "HDR by PQ", 18: "HDR by HLG"}
 SRGB, LINEAR = 13, 8
 ICC_TAGS = 128  # where the list of an ICC profile's tags begins (ICC.1:2022, 7.3)
 MOST_TAGS, MOST_PROFILE_BYTES, TAG_HEAD = 100, 2**20, 16
-# a curve of no points, and one number of it, 1, as ICC.1:2022, 10.6 and 10.18 store it
+# a curve of no points, one from 0 to 1, and one number of it, 1, as ICC.1:2022, 10.6 and 10.18 store it
 LINEAR_CURVES = (
     b"curv" + bytes(8),
+    b"curv" + bytes(4) + struct.pack(">IHH", 2, 0, 0xFFFF),
     b"curv" + bytes(4) + struct.pack(">IH", 1, 0x100),
     b"para" + bytes(8) + struct.pack(">I", 0x10000),
 )

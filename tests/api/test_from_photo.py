@@ -40,6 +40,15 @@ def test_a_webp_tells_as_much(client: TestClient) -> None:
     assert answer.json() == client.post(PATH, content=PHOTOGRAPH, headers={"Content-Type": "image/jpeg"}).json()
 
 
+def test_what_the_file_notes_of_its_making_is_told(client: TestClient) -> None:
+    xmp = b'http://ns.adobe.com/xap/1.0/\0crs:HasCrop="True" crs:AlreadyApplied="True" SpecialType-PORTRAIT'
+    content = PHOTOGRAPH[:2] + b"\xff\xe1" + (len(xmp) + 2).to_bytes(2, "big") + xmp + PHOTOGRAPH[2:]
+    usual, noted = (client.post(PATH, content=each).json() for each in (PHOTOGRAPH, content))
+    (portrait, crop) = noted["warnings"][len(usual["warnings"]) :]
+    assert "a portrait mode" in portrait
+    assert "cropped" in crop
+
+
 def test_what_is_no_photograph_is_refused(client: TestClient) -> None:
     for content, kind, status in (
         (b"", "image/jpeg", 422),

@@ -67,6 +67,13 @@ def test_tags_are_read_from_a_webp_of_either_form(prefix: bytes) -> None:
     assert found == D200
 
 
+def test_fractions_with_a_sign_are_read() -> None:
+    signed = exif_of({}, {F_NUMBER: (28, 10)}).replace(
+        struct.pack("<HH", F_NUMBER, 5), struct.pack("<HH", F_NUMBER, 10)
+    )
+    assert read_exif(signed).f_number == 2.8
+
+
 def test_numbers_with_a_floating_point_are_read() -> None:
     found = read_exif(exif_of({}, {F_NUMBER: 1.8, FOCAL: 35.0, SUBJECT: 2.5, ZOOM: 1.0}))
     assert (found.f_number, found.focal_length_mm, found.subject_distance_m, found.digital_zoom) == (1.8, 35, 2.5, 1)
@@ -100,6 +107,13 @@ def test_the_pixel_pitch_of_the_exif_comes_first() -> None:
     drafted = draft(focal_plane_pitch_um=6.05)
     assert drafted.lens.pixel_pitch_um == 6.05
     assert not said(drafted, "crop")
+
+
+def test_a_pitch_that_nothing_else_agrees_with_is_told() -> None:
+    alone: dict[str, Any] = {"model": "Canon EOS R50", "focal_length_35mm": None, "focal_plane_pitch_um": 3.72}
+    assert said(draft(2048, 1365, **alone, width_px=2048), "7.62 mm wide by the pixel pitch", "check lens.pixel_pitch")
+    for known in ({"focal_length_35mm": 52.0}, {"model": "NIKON D200"}):
+        assert not said(draft(**alone | {"focal_plane_pitch_um": 6.05} | known), "pitch in its EXIF alone")
 
 
 @pytest.mark.parametrize(

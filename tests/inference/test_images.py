@@ -25,6 +25,7 @@ from tests.inference.photographs import (
     Order,
     corners,
     encoded,
+    exif_block,
     exif_of,
     hostile_png,
     jpeg,
@@ -106,8 +107,8 @@ def test_sixteen_bits_are_scaled_and_not_cut(kind: str) -> None:
     assert np.abs(rgb - deep / 257).max() <= 0.5
 
 
-@pytest.mark.parametrize(("kind", "bits"), [(".png", 12), (".tiff", 12), (".png", 10)])
-def test_ten_or_twelve_bits_in_a_file_of_sixteen_are_no_dark_picture(kind: str, bits: int) -> None:
+@pytest.mark.parametrize(("kind", "bits"), [(".png", 14), (".png", 12), (".tiff", 12), (".png", 10)])
+def test_ten_to_fourteen_bits_in_a_file_of_sixteen_are_no_dark_picture(kind: str, bits: int) -> None:
     most = 2**bits - 1
     ramp = np.linspace(0, most, 48 * 64).round().astype(np.uint16).reshape(48, 64)
     for pixels in (ramp, np.dstack([ramp] * 3)):
@@ -116,8 +117,8 @@ def test_ten_or_twelve_bits_in_a_file_of_sixteen_are_no_dark_picture(kind: str, 
         assert [*photograph.warnings] == [f"nothing in its 16 bits is above {most}: read as {bits} bits, and as sRGB"]
         np.testing.assert_array_equal(read_stored_frame(encoded(kind, pixels)), photograph.rgb)
     brighter = ramp.copy()
-    brighter[0, 0] = 4096
-    for pixels, brightest in ((brighter, 16), (np.zeros_like(ramp), 0)):
+    brighter[0, 0] = 16384
+    for pixels, brightest in ((brighter, 64), (np.zeros_like(ramp), 0)):
         photograph = read_photograph(encoded(kind, pixels))
         assert (photograph.rgb.max(), photograph.warnings) == (brightest, ())
     assert read_photograph(encoded(kind, np.full_like(ramp, 255))).rgb.max() == 16  # a lens cap's
@@ -396,6 +397,7 @@ PROFILES = {
         icc_profile(rTRC=b"curv" + bytes(4) + b"\x00\x00\x00\x01\x01\x00"),
         icc_profile(rTRC=b"para" + bytes(8) + b"\x00\x01\x00\x00"),
         icc_profile(kTRC=b"curv" + bytes(8)),
+        icc_profile(rTRC=b"curv" + bytes(4) + b"\x00\x00\x00\x02\x00\x00\xff\xff"),
     ],
     "HDR by PQ": [
         icc_profile(rTRC=b"curv" + bytes(4) + b"\x00\x00\x04\x00", cicp=b"cicp" + bytes(4) + b"\x09\x10\0\1")
@@ -429,10 +431,42 @@ def test_a_png_s_number_of_its_curve_counts_before_its_profile() -> None:
         assert read_header(data[:33] + png_chunk(b"iCCP", damaged) + data[33:]).other_curve is None
 
 
+def test_a_png_s_gamma_counts_where_nothing_else_tells_its_curve() -> None:
+    data, linear = png(corners()), png_chunk(b"gAMA", (100_000).to_bytes(4, "big"))
+    usual, srgb = png_chunk(b"gAMA", (45_455).to_bytes(4, "big")), png_chunk(b"sRGB", b"\0")
+    profile = png_chunk(b"iCCP", b"x\0\0" + zlib.compress(P3))
+    for parts, curve in ((linear, "linear light"), (usual, None), (srgb + linear, None), (profile + linear, None)):
+        assert read_header(data[:33] + parts + data[33:]).other_curve == curve
+
+
+@pytest.mark.parametrize("kind", ["png", "tiff"])
+@pytest.mark.parametrize(("mode", "is_told"), [("P", True), ("1", True), ("L", False), ("RGB", False)])
+def test_a_palette_s_few_colours_are_told(kind: str, mode: str, *, is_told: bool) -> None:
+    out = BytesIO()
+    Image.fromarray(corners()).convert(mode).save(out, kind)
+    if (kind, mode) == ("tiff", "1"):
+        with pytest.raises(UnsupportedKind, match="8 or 16 bits"):
+            read_photograph(out.getvalue())
+    else:
+        assert any("palette" in words for words in read_photograph(out.getvalue()).warnings) == is_told
+
+
+def test_of_two_exif_blocks_the_first_counts_as_it_does_to_viewers() -> None:
+    assert read_header(with_exif(jpeg(corners(), 3), exif_block(6))).orientation == 6
+
+
+def test_a_bigtiff_is_told_what_to_become() -> None:
+    for order in ("<", ">"):
+        out = BytesIO()
+        tifffile.imwrite(out, corners(), bigtiff=True, byteorder=order, photometric="rgb")
+        with pytest.raises(UnsupportedKind, match="BigTIFF"):
+            read_photograph(out.getvalue())
+
+
 def test_photographs_of_a_folder_are_known_by_how_cameras_name_them(tmp_path: Path) -> None:
-    for name in ("b.HIF", "a.JPG", "c.heic", "d.NEF", "e.txt", "f.mov"):
+    for name in ("b.HIF", "a.JPG", "c.heic", "d.NEF", "e.txt", "f.mov", "g.jfif", "h.MPO"):
         (tmp_path / name).touch()
-    assert [path.name for path in photographs_in(tmp_path)] == ["a.JPG", "b.HIF", "c.heic", "d.NEF"]
+    assert [path.name for path in photographs_in(tmp_path)] == ["a.JPG", "b.HIF", "c.heic", "d.NEF", "g.jfif", "h.MPO"]
 
 
 KIND_OF_PAGE, OTHER_TAG = (struct.pack("<HHI", tag, 4, 1) for tag in (254, 253))
@@ -467,6 +501,16 @@ def test_of_several_pictures_the_first_is_read_and_that_is_told(data: bytes) -> 
     assert photograph.warnings == ("the file has more than one picture: the first was read",)
     assert photograph.rgb[4, 4].argmax() == 0
     assert photograph.rgb[4, -5].argmax() == 1
+
+
+def test_a_small_copy_in_front_is_not_taken_for_the_picture() -> None:
+    for others in ({}, {"subifds": 1}):
+        out = BytesIO()
+        with tifffile.TiffWriter(out) as writer:
+            writer.write(corners(24, 32), photometric="rgb", subfiletype=1, metadata=None, **others)
+            writer.write(corners(), photometric="rgb", metadata=None)
+        with pytest.raises(UnsupportedKind, match="a small copy of another"):
+            read_photograph(out.getvalue())
 
 
 @pytest.mark.parametrize("data", [pages(), pages(1), png(corners()), webp(corners())])

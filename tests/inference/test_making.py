@@ -1,11 +1,16 @@
 """Pictures that were cut out of larger ones or computed, and all those that were not."""
 
+from io import BytesIO
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from service.inference.images import read_photograph
 from service.opencv import cv2
+from tests.inference.heics import heic
 from tests.inference.photographs import encoded, exif_with_thumbnail, jpeg, with_exif
 
 Picture = NDArray[np.uint8]
@@ -70,9 +75,31 @@ def test_what_is_no_thumbnail_is_passed_over(whole: Picture, data: bytes) -> Non
     ],
 )
 def test_what_an_editor_or_a_phone_notes_is_told(whole: Picture, said: bytes, word: str) -> None:
-    data = jpeg(whole)
-    payload = b"http://ns.adobe.com/xap/1.0/\0<rdf:Description " + said + b"/>"
-    data = data[:2] + b"\xff\xe1" + (len(payload) + 2).to_bytes(2, "big") + payload + data[2:]
-    warnings = read_photograph(data).warnings
-    assert bool(warnings) == bool(word)
-    assert all(warning.startswith("its XMP says") and word in warning for warning in warnings)
+    xmp = b"<rdf:Description " + said + b"/>"
+    for kind in ("JPEG", "PNG", "TIFF", "WEBP"):
+        warnings = read_photograph(with_xmp(whole[:64, :64], kind, xmp)).warnings
+        assert bool(warnings) == bool(word)
+        assert all(warning.startswith("its XMP says") and word in warning for warning in warnings)
+
+
+def with_xmp(picture: Picture, kind: str, xmp: bytes) -> bytes:
+    """A file of a kind with this XMP, and in a PNG a comment before it."""
+    out, texts, options = BytesIO(), PngInfo(), {"xmp": xmp}
+    if kind == "PNG":
+        texts.add_itxt("Comment", "of no use")
+        texts.add_itxt("XML:com.adobe.xmp", xmp.decode())
+        options = {"pnginfo": texts}
+    elif kind == "TIFF":
+        options = {"tiffinfo": {700: xmp}}
+    Image.fromarray(np.ascontiguousarray(picture)).save(out, kind, **options)
+    return out.getvalue()
+
+
+@pytest.mark.parametrize("name", [b"DualShot_DepthMap_1", b"SingeShot_DepthMap_1", b"MotionPhoto_Data", b""])
+def test_a_samsung_s_portrait_is_known_by_the_depth_map_behind_it(whole: Picture, name: bytes) -> None:
+    block = b"\0\0\xb1\x0a" + len(name).to_bytes(4, "little") + name + bytes(40)
+    for data in (jpeg(whole), heic()):
+        warnings = read_photograph(data + len(block).to_bytes(4, "big") + b"sefd" + block[8:]).warnings
+        assert [*warnings] == ["it holds the depth map of a portrait mode: its blur may be computed, and no lens'"] * (
+            b"DepthMap" in name
+        )
