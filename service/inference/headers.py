@@ -15,6 +15,7 @@ from typing import Any, Literal
 from service.errors import InvalidImage, UnsupportedKind
 from service.inference.heic import curve_of_primary, exif_item, is_animated, kind_of, primary_picture
 from service.inference.tone_curve import CURVES, LINEAR, SRGB, curve_of_profile, unpacked_profile
+from service.inference.vp8 import quality as quality_of_vp8
 
 Kind = Literal["jpeg", "png", "tiff", "webp", "heic", "avif", "raw"]
 
@@ -67,8 +68,8 @@ class Header:
     """Stored size in pixels, before orientation (EXIF, 1..8) is applied; ``exif`` is the EXIF, without a signature.
 
     Of a tiff or raw file that is the file. ``has_more``: other pages or frames follow. ``curve``: what its values have,
-    by H.273's number. ``quality``: of a jpeg, 1 to 100, as most programs count it. ``xmp``: not of heic, avif and raw.
-    ``has_few_colours``: of a palette, or of less than 8 bits.
+    by H.273's number. ``quality``: of a jpeg or lossy webp, to 100, as most programs count it. ``xmp``: not of
+    heic, avif and raw. ``has_few_colours``: of a palette, or of less than 8 bits.
     """
 
     kind: Kind
@@ -243,6 +244,7 @@ def _webp(data: bytes) -> Header:
         raise InvalidImage.cut_off("webp")
     size: tuple[int, int] | None = None
     exif = profile = xmp = b""
+    quality: float | None = None
     frames = 0
     at = 12
     for _ in range(MOST_PARTS):
@@ -255,6 +257,8 @@ def _webp(data: bytes) -> Header:
             exif = data[at + 8 : at + 8 + chunk].removeprefix(EXIF_SIGNATURE)
         elif name == b"ICCP":
             profile = data[at + 8 : at + 8 + chunk]
+        elif name == b"VP8 " and quality is None:
+            quality = quality_of_vp8(data[at + 8 : at + 8 + chunk])
         elif name == b"XMP ":
             xmp = data[at + 8 : at + 8 + chunk]
         at += 8 + chunk + chunk % 2
@@ -262,8 +266,8 @@ def _webp(data: bytes) -> Header:
         raise _too_many_parts("webp")
     if size is None:
         raise InvalidImage("The webp file holds no picture.")
-    curve = curve_of_profile(profile)
-    return Header("webp", *size, _exif_orientation(exif), exif=exif, has_more=frames > 1, curve=curve, xmp=xmp)
+    curve, orientation = curve_of_profile(profile), _exif_orientation(exif)
+    return Header("webp", *size, orientation, None, exif, frames > 1, curve, quality, xmp)
 
 
 def _webp_size(name: bytes, payload: bytes) -> tuple[int, int] | None:

@@ -77,7 +77,8 @@ TURNS: dict[int, tuple[bool, bool, bool]] = {
 UNTURNS = {orientation: {6: 8, 8: 6}.get(orientation, orientation) for orientation in TURNS}
 # not IMREAD_COLOR_RGB: OpenCV 5.0 leaves a 16-bit TIFF read so uninitialised
 DECODE_FLAGS = cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-LEAST_QUALITY = 60  # of a jpeg, that the model was trained on
+# below which metres go wrong: a jpeg's is the least that the model was trained on, and a webp's filter blurs
+LEAST_QUALITY: dict[Kind, int] = {"jpeg": 60, "webp": 76}
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,8 +134,8 @@ def read_photograph(data: bytes, media_type: str | None = None, limits: ImageLim
         warnings += ("the file has more than one picture: the first was read",)
     if header.other_curve is not None:
         warnings += (f"its colour profile is {header.other_curve}, and it was read as sRGB: export it as sRGB",)
-    if header.quality is not None and round(header.quality) < LEAST_QUALITY:
-        said = f"a jpeg of quality {header.quality:.0f}, below the {LEAST_QUALITY} that the model was trained on"
+    if header.quality is not None and round(header.quality) < LEAST_QUALITY[kind]:
+        said = f"a {kind} of quality {header.quality:.0f}, below the {LEAST_QUALITY[kind]} that metres need"
         warnings += (f"{said}: send what the camera stored",)
     if header.has_few_colours:
         warnings += ("it has a palette's few colours, whose steps are taken for edges: send what the camera stored",)

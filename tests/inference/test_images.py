@@ -170,6 +170,18 @@ def test_a_jpeg_coarser_than_the_model_learned_of_is_told(quality: int, *, is_to
     assert len(read_photograph(data).warnings) == is_told
 
 
+@pytest.mark.parametrize(("quality", "is_told"), [(100, False), (90, False), (80, False), (75, True), (30, True)])
+def test_a_webp_too_coarse_for_metres_is_told(quality: int, *, is_told: bool) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (96, 128, 3), np.uint8)
+    data = encoded(".webp", cv2.GaussianBlur(noise, (0, 0), 2), cv2.IMWRITE_WEBP_QUALITY, quality)
+    found = read_header(data).quality
+    assert found is not None
+    assert quality - 15 < found < quality + 1
+    warnings = [f"a webp of quality {found:.0f}, below the 76 that metres need: send what the camera stored"] * is_told
+    assert [*read_photograph(data).warnings] == warnings
+    assert read_header(webp(corners())).quality is None
+
+
 def test_the_quality_of_a_jpeg_with_steps_of_16_bits_is_that_of_its_luminance() -> None:
     data = jpeg(corners(), quality=40)
     at = data.index(b"\xff\xdb")
