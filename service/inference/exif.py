@@ -52,6 +52,14 @@ class Exif:
         return self.zoom > MOST_ZOOM
 
     @property
+    def equivalent_by_pitch_mm(self) -> float | None:
+        """The 35-mm equivalent of the focal length by a pixel's size, for Canon notes none; None where unknown."""
+        if self.focal_length_mm is None or self.focal_plane_pitch_um is None or not self.width_px or not self.height_px:
+            return None
+        diagonal_mm = self.focal_plane_pitch_um / 1e3 * math.hypot(self.width_px, self.height_px)
+        return self.focal_length_mm / diagonal_mm * FULL_FRAME_DIAGONAL_MM
+
+    @property
     def focus_from_lens_m(self) -> float | None:
         """Where the lens was focused, if ``subject_distance_m`` counts from the sensor; None where none is so near."""
         distance_m, focal_length_mm = self.subject_distance_m, self.focal_length_mm

@@ -159,10 +159,12 @@ def _other_focus(exif: Exif, focus_distance_m: float) -> Iterator[str]:
 def maybe_another_part(exif: Exif, camera: Camera) -> Iterator[str]:
     """A warning where the EXIF tells, by no zoom but by its 35-mm equivalent, of another field of view.
 
+    Of a camera whose lens is not known a pixel's size tells it too, which a program that resizes may leave as it was.
     ``camera`` has the photograph's size. That a lens focused close may see less is allowed for, and of another focal
     length than the lens' ``taken_otherwise`` tells.
     """
-    equivalent_mm, focal_length_m = exif.focal_length_35mm, (exif.focal_length_mm or math.inf) / 1e3
+    by_pitch_mm = exif.equivalent_by_pitch_mm if camera.focal_length_m is None else None
+    equivalent_mm, focal_length_m = exif.focal_length_35mm or by_pitch_mm, (exif.focal_length_mm or math.inf) / 1e3
     if equivalent_mm is None or camera.intrinsics is None or exif.is_zoomed:
         return
     is_other_lens = abs(focal_length_m / (camera.focal_length_m or focal_length_m) - 1) > LENS_TOLERANCE
@@ -173,8 +175,8 @@ def maybe_another_part(exif: Exif, camera: Camera) -> Iterator[str]:
     longer = thin_lens.image_distance_in_focal_lengths(camera.focus_distance_m, focal_length_m)
     if not 1 / SAME_VIEW <= camera_mm / equivalent_mm <= SAME_VIEW * longer:
         yield (
-            f"its EXIF says it shows what {equivalent_mm:g} mm show on 35-mm film, the camera what {camera_mm:.3g} do: "
-            "another lens or part of the sensor (a phone's 2x, a crop mode) is another camera, drafted from its picture"
+            f"its EXIF says it shows what {equivalent_mm:.3g} mm show on 35-mm film, the camera what {camera_mm:.3g} "
+            "do: another lens, zoom or part of the sensor (a phone's 2x, a crop mode) is another camera, drafted from its picture"
         )
 
 

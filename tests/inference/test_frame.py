@@ -135,6 +135,19 @@ def test_a_part_of_the_sensor_that_no_zoom_tells_of_is_known_by_its_field_of_vie
     assert not [*maybe_another_part(exif, replace(camera, intrinsics=None))]
 
 
+@pytest.mark.parametrize(("focal_length_mm", "is_another"), [(50.0, False), (24.0, True), (70.0, True), (None, False)])
+def test_a_zoom_of_a_calibrated_camera_is_known_by_what_a_pixel_measures(
+    focal_length_mm: float | None, *, is_another: bool
+) -> None:
+    calibrated = Camera(6000, 4000, 2.0, 30.0, intrinsics=Intrinsics.centred(8360.0, 6000, 4000))
+    exif = Exif(focal_length_mm=focal_length_mm, width_px=6000, height_px=4000, focal_plane_pitch_um=5.98)
+    for camera in (calibrated, calibrated.resized(1500, 1000)):
+        assert len([*maybe_another_part(exif, camera)]) == is_another
+    for unknown in ({"width_px": None}, {"height_px": None}, {"focal_plane_pitch_um": None}):
+        assert not [*maybe_another_part(replace(exif, **unknown), calibrated)]
+    assert not [*maybe_another_part(exif, replace(calibrated, focal_length_m=focal_length_mm and 0.05))]
+
+
 def test_a_lens_focused_close_may_see_less_than_its_equivalent_tells() -> None:
     macro = Exif(focal_length_mm=100.0, focal_length_35mm=100.0)
     at_half_size = Camera(6000, 4000, 0.3, 300.0, intrinsics=Intrinsics.centred(25_000.0, 6000, 4000))
