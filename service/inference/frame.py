@@ -176,7 +176,8 @@ def maybe_another_part(exif: Exif, camera: Camera) -> Iterator[str]:
     if not 1 / SAME_VIEW <= camera_mm / equivalent_mm <= SAME_VIEW * longer:
         yield (
             f"its EXIF says it shows what {equivalent_mm:.3g} mm show on 35-mm film, the camera what {camera_mm:.3g} "
-            "do: another lens, zoom or part of the sensor (a phone's 2x, a crop mode) is another camera, drafted from its picture"
+            "do: another lens, zoom or part of the sensor (a phone's 2x, a crop mode) is another camera, drafted from "
+            "its picture"
         )
 
 
