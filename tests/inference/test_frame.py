@@ -145,7 +145,8 @@ def test_a_zoom_of_a_calibrated_camera_is_known_by_what_a_pixel_measures(
         assert len([*maybe_another_part(exif, camera)]) == is_another
     for unknown in ({"width_px": None}, {"height_px": None}, {"focal_plane_pitch_um": None}):
         assert not [*maybe_another_part(replace(exif, **unknown), calibrated)]
-    assert not [*maybe_another_part(exif, replace(calibrated, focal_length_m=focal_length_mm and 0.05))]
+    resized = replace(exif, focal_length_mm=50.0, focal_plane_pitch_um=1.5)  # by a program that left the pitch
+    assert not [*maybe_another_part(resized, replace(calibrated, focal_length_m=0.05))]
 
 
 def test_a_lens_focused_close_may_see_less_than_its_equivalent_tells() -> None:
