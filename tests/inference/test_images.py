@@ -516,10 +516,10 @@ def test_of_several_pictures_the_first_is_read_and_that_is_told(data: bytes) -> 
 
 
 def test_a_small_copy_in_front_is_not_taken_for_the_picture() -> None:
-    for others in ({}, {"subifds": 1}):
+    for below in (None, 1):
         out = BytesIO()
         with tifffile.TiffWriter(out) as writer:
-            writer.write(corners(24, 32), photometric="rgb", subfiletype=1, metadata=None, **others)
+            writer.write(corners(24, 32), photometric="rgb", subfiletype=1, metadata=None, subifds=below)
             writer.write(corners(), photometric="rgb", metadata=None)
         with pytest.raises(UnsupportedKind, match="a small copy of another"):
             read_photograph(out.getvalue())

@@ -1,6 +1,7 @@
 """Pictures that were cut out of larger ones or computed, and all those that were not."""
 
 from io import BytesIO
+from typing import Any
 
 import numpy as np
 import pytest
@@ -84,7 +85,8 @@ def test_what_an_editor_or_a_phone_notes_is_told(whole: Picture, said: bytes, wo
 
 def with_xmp(picture: Picture, kind: str, xmp: bytes) -> bytes:
     """A file of a kind with this XMP, and in a PNG a comment before it."""
-    out, texts, options = BytesIO(), PngInfo(), {"xmp": xmp}
+    out, texts = BytesIO(), PngInfo()
+    options: dict[str, Any] = {"xmp": xmp}
     if kind == "PNG":
         texts.add_itxt("Comment", "of no use")
         texts.add_itxt("XML:com.adobe.xmp", xmp.decode())
