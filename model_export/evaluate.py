@@ -41,7 +41,10 @@ from service.optics import thin_lens
 from service.optics.camera import Camera
 
 CLEARLY_OUT = 0.25  # |x| from where on the side of focus is asked for
-SAMPLED_PIXELS = 3000
+SAMPLED_PIXELS = 3000  # of a picture
+SAMPLED_CELLS = 2**15
+LEAST_COLUMNS = 16
+EXAMPLE_PX = 1500  # of a side, or less
 
 
 class _RememberingPair(GraphPair):
@@ -92,7 +95,7 @@ class Examiner:
     def _scored(self, case: Case, told: DepthMap, blur: Pixels | None = None) -> tuple[Outcome, Example]:
         scored = np.flatnonzero(np.isfinite(case.truth_m))
         truth, depth = case.truth_m.ravel()[scored], completed(told.depth_m).ravel()[scored]
-        some = slice(None, None, max(1, truth.size // SAMPLED_PIXELS))
+        some = _some(scored, case.truth_m.shape[1], SAMPLED_PIXELS)
         sigma_m, answer_m = (values.ravel()[scored[some]] for values in (told.sigma_m, told.depth_m))
         defocus = thin_lens.relative_defocus(truth[some], case.camera.focus_distance_m)
         outcome = Outcome(
@@ -107,7 +110,9 @@ class Examiner:
             blur=blur,
             sides=_sides(case, told) if case.side == "auto" else None,
         )
-        return outcome, Example(case.image, case.truth_m, told.depth_m, told.sigma_m)
+        every = max(1, max(case.truth_m.shape) // EXAMPLE_PX)
+        shown = (case.image, case.truth_m, told.depth_m, told.sigma_m)
+        return outcome, Example(*(each[::every, ::every] for each in shown))
 
     def _blur(self, case: Case) -> Pixels | None:
         """Lambda where the case knows it, at the middles of the cells of what a request would read."""
@@ -134,8 +139,21 @@ def _at_cells(truth: Map, answer: Map, stated: Map) -> Pixels:
         for cells, size in zip(answer.shape, truth.shape, strict=True)
     )
     truth = truth[np.ix_(rows, columns)]
-    known = np.isfinite(truth)
-    return Pixels(truth[known], answer[known], stated[known])
+    known = np.flatnonzero(np.isfinite(truth))
+    some = known[_some(known, truth.shape[1], SAMPLED_CELLS)]
+    return Pixels(*(maps.ravel()[some] for maps in (truth, answer, stated)))
+
+
+def _some(places: NDArray[np.intp], width: int, most: int) -> NDArray[np.intp]:
+    """Which of some places in a map of that width to take, evenly: no more than twice ``most``.
+
+    Where every so-manieth is in one of a few columns, as in a picture whose width that divides, it is one near by.
+    """
+    step = max(1, places.size // most)
+    taken = np.arange(0, places.size, step)
+    if step > 1 and np.unique(places[taken] % width).size < LEAST_COLUMNS:
+        taken = np.minimum(taken + np.random.default_rng(0).integers(0, step, taken.size), places.size - 1)
+    return taken
 
 
 @lru_cache(1)

@@ -63,6 +63,19 @@ def test_a_right_answer_scores_nothing_and_a_wrong_one_its_error(oracle: Examine
         assert outcome.scored_pixels == 64 * 86
 
 
+def test_a_large_picture_is_seen_all_over_and_no_larger_in_what_is_kept_of_it(oracle: Examiner) -> None:
+    """Every 100th of its pixels, which are 3000 such, would be its left column."""
+    truth = np.tile(np.linspace(1, 3, 100, dtype=np.float32), (3000, 1))
+    camera = Camera(100, 3000, 2.0, 6.0, 0.5)
+    large = Case("large", np.full((3000, 100, 3), LEVEL, np.uint8), truth, camera, "near", truth)
+    outcome, example = oracle.answer(large)
+    assert outcome.depth.truth.mean() == pytest.approx(2, abs=0.05)
+    assert np.unique(outcome.depth.truth).size > 90
+    assert outcome.blur is not None
+    assert outcome.blur.truth.size < 2**16
+    assert example.image.shape[0] == example.sigma_m.shape[0] == 1500
+
+
 def test_a_summary_is_pooled_over_pixels_and_averaged_over_pictures(oracle: Examiner) -> None:
     small = case(2.0)
     small.truth_m[:, :53] = np.nan
