@@ -32,8 +32,13 @@ class Checkpoint:
         }
         path.parent.mkdir(parents=True, exist_ok=True)
         scratch = path.with_suffix(".part")
-        torch.save(content, scratch)
-        scratch.replace(path)
+        try:
+            with scratch.open("wb") as file:
+                torch.save(content, file)
+            scratch.replace(path)
+        except (OSError, RuntimeError) as exc:  # torch's own of a full disk
+            scratch.unlink(missing_ok=True)
+            raise OSError(f"{path} cannot be written: {str(exc.__context__ or exc).splitlines()[0]}") from exc
 
     @classmethod
     def load(cls, path: Path) -> "Checkpoint":
@@ -45,7 +50,7 @@ class Checkpoint:
             raise ValueError(f"{path} is no checkpoint of camind, or is cut off or damaged") from exc
         try:
             config = TrainConfig.from_dict(told)
-        except TypeError as exc:
+        except (TypeError, LookupError, AttributeError) as exc:
             raise ValueError(f"{path} was written by another version of camind: {exc}") from exc
         return cls(config, step, modules, content.get("optimizers", []))
 

@@ -19,6 +19,7 @@ from service.config import INT8
 from service.inference.artifact import load_model_folder
 
 if TYPE_CHECKING:  # importing torch takes seconds; a command that needs it does so itself
+    from model_export.summary import Report
     from model_export.verify import Difference
 
 commands = typer.Typer(help="Train, export and score models.")
@@ -95,7 +96,10 @@ def _plain_failures() -> Iterator[None]:
 @commands.command()
 def train(
     run: Annotated[
-        Path, typer.Option(help="folder of the run: its checkpoint lies there and is gone on from", file_okay=False)
+        Path,
+        typer.Option(
+            help="folder of the run: its checkpoint lies there and is gone on from", file_okay=False, writable=True
+        ),
     ],
     textures: Textures,
     frames: Frames = None,
@@ -191,7 +195,7 @@ def average(
 @commands.command()
 def export(
     checkpoint: CheckpointPath,
-    out: Annotated[Path, typer.Option(help="model folder to write", file_okay=False)],
+    out: Annotated[Path, typer.Option(help="model folder to write", file_okay=False, writable=True)],
     textures: Annotated[
         Path | None,
         typer.Option(help="pictures that a run was trained with, with LICENCES.md", exists=True, file_okay=False),
@@ -213,6 +217,8 @@ def export(
         from model_export.quantized import quantised_graphs
 
     pictures = [folder for folder in (textures, frames) if folder is not None]
+    with _plain_failures():
+        out.mkdir(parents=True, exist_ok=True)
     # what breaks off leaves no folder that serves, without its corrections
     with TemporaryDirectory() as scratch, progress_bar(Console(stderr=True)) as progress, _plain_failures():
         built = Path(scratch)
@@ -263,14 +269,17 @@ def evaluate(
     quick: Annotated[bool, typer.Option(help="a few pictures of each set")] = False,
     out: Annotated[
         Path | None,
-        typer.Option(help="folder for report.html, report.json and pictures; beside/ has the other's", file_okay=False),
+        typer.Option(
+            help="folder for report.html, report.json and pictures; beside/ has the other's",
+            file_okay=False,
+            writable=True,
+        ),
     ] = None,
     update_card: Annotated[bool, typer.Option(help="write the scores into cards and manifests")] = False,
 ) -> None:
     """Score a model on pictures that no training saw, beside the best constant depth of each picture."""
     with _training_parts():
         from model_export import report as reports
-        from model_export.card import record_scores
         from model_export.evaluate import evaluate as run_evaluation
         from model_export.evaluation_sets import FOLDERS, evaluation_sets
 
@@ -280,7 +289,8 @@ def evaluate(
             load_model_folder(folder)
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
-        sets = evaluation_sets(data, quick)
+        with Console(stderr=True).status("reading pictures"):
+            sets = evaluation_sets(data, quick)
     if missing := [name for name in FOLDERS if not any(each.name.startswith(name) for each in sets)]:
         typer.secho(f"{data} has no pictures of {', '.join(missing)}: without them", err=True)
     with progress_bar(Console(stderr=True)) as progress, _plain_failures():
@@ -294,14 +304,21 @@ def evaluate(
     if beside is not None:
         tables |= {f"{found[1].model} beside {found[0].model}": reports.beside(*found)}
     _print([_as_table(title, head, rows) for title, (head, rows) in tables.items()])
+    with _plain_failures():
+        _keep(found, out, models if update_card else [], "camind evaluate --data DATA" + " --quick" * quick)
+
+
+def _keep(found: "list[Report]", out: Path | None, models: list[Path], command: str) -> None:
+    """Write reports into a folder, and what they found into the cards of models."""
+    from model_export.card import record_scores
+    from model_export.report import markdown, write
+
     if out is not None:
         for report, folder in zip(found, (out, out / "beside"), strict=False):
-            reports.write(report, folder)
+            write(report, folder)
         typer.echo(out / "report.html")
-    if update_card:
-        command = "camind evaluate --data DATA" + " --quick" * quick
-        for report, folder in zip(found, models, strict=True):
-            record_scores(folder, report.scores(), reports.markdown(report), command)
+    for report, folder in zip(found, models, strict=False):
+        record_scores(folder, report.scores(), markdown(report), command)
 
 
 def _as_table(title: str, head: list[str], rows: list[list[str]]) -> Table:
@@ -317,7 +334,7 @@ def speed(
     model: Model = DEFAULT_MODEL,
     rounds: Annotated[int, typer.Option(min=2, help="times that everything is timed, in turns")] = 10,
     seconds: Annotated[float, typer.Option(min=1, help="how long each number of clients asks")] = 10.0,
-    out: Annotated[Path | None, typer.Option(help="JSON file to write", dir_okay=False)] = None,
+    out: Annotated[Path | None, typer.Option(help="JSON file to write", dir_okay=False, writable=True)] = None,
 ) -> None:
     """Time the graphs beside the paper's network, whole requests, and many clients; takes the machine to itself."""
     if context.invoked_subcommand is not None:
@@ -327,6 +344,8 @@ def speed(
 
     with _plain_failures():
         load_model_folder(model)
+        if out is not None:
+            out.parent.mkdir(parents=True, exist_ok=True)
     with progress_bar(Console(stderr=True)) as progress:
         task = progress.add_task("measuring", total=bench_speed.steps(rounds))
         report = bench_speed.measure(model, rounds, seconds, lambda: progress.advance(task))

@@ -245,8 +245,9 @@ def photographed_cases(folder: Path, count: int) -> Iterator[Case]:
 
 
 def _spread(folder: Path, count: int) -> Iterator[Photo]:
-    """About ``count`` of a folder's photos, spread over it."""
-    return load_photos(folder, max(1, math.ceil(len(pictures_of(folder)) / count)))
+    """About ``count`` of a folder's photos, spread over it, of those whose depth is known anywhere."""
+    photos = load_photos(folder, max(1, math.ceil(len(pictures_of(folder)) / count)))
+    return (photo for photo in photos if np.isfinite(photo.depth_m).any())
 
 
 @dataclass(frozen=True, slots=True)

@@ -174,7 +174,7 @@ def _curve(axes: Axes, at: Map, pixels: Pixels, label: str, *, logarithmic: bool
     """Median relative error of pixels against a quantity, in bins that hold enough of them."""
     low, high = np.quantile(at, [0.01, 0.99])
     edges = np.geomspace(low, high, BINS + 1) if logarithmic else np.linspace(low, high, BINS + 1)
-    inside = np.digitize(at, edges) - 1
+    inside = np.searchsorted(edges[1:-1], at)  # what is beyond the ends is in the first and the last
     rows = [
         (np.median(at[inside == i]), np.median(np.abs(pixels.error[inside == i])))
         for i in range(BINS)
@@ -234,6 +234,8 @@ def _calibration(axes: Axes, report: Report) -> None:
     """How many errors lie within the interval that should hold a given share of them (Laplace)."""
     for s in _of_depth(report):
         told = s.depth.answered
+        if not told.stated.size:
+            continue
         scale = np.maximum(told.stated, 1e-6) / math.sqrt(2)
         error = np.abs(np.log(told.answer / told.truth))
         axes.plot(NOMINAL, [(error <= -scale * math.log(1 - p)).mean() for p in NOMINAL], label=s.name)

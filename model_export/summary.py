@@ -171,7 +171,8 @@ class Summary:
     def as_dict(self) -> dict[str, object]:
         plain = ("name", "mode", "pictures", "answered", "median_error", "certain_abs_rel", "order", *EQUAL)
         tables = ("pooled", "mean", "constant_pooled", "constant_mean")
-        shares = {"kept_abs_rel": dict(zip(KEPT_SHARES, self.kept_abs_rel, strict=True)), "within": self.within}
+        within = [share if math.isfinite(share) else None for share in self.within]  # JSON has no NaN
+        shares = {"kept_abs_rel": dict(zip(KEPT_SHARES, self.kept_abs_rel, strict=True)), "within": within}
         parts = {"sides": self.sides, "relief": self.relief}
         told = {name: asdict(part) if part else None for name, part in parts.items()}
         scores = {n: getattr(self, n).as_dict() for n in tables}

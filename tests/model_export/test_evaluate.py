@@ -190,10 +190,19 @@ def test_two_models_are_compared_on_the_same_pictures(tiny_model_dir: Path, tmp_
 def test_plots_of_depth_show_a_users_own_sets(oracle: Examiner, tmp_path: Path) -> None:
     outcome, example = oracle.answer(case(1.0))
     sets = [summarise(name, "gt", [outcome]) for name in ("desk", "d200", "rgbd view 0.8", "plane 1 m")]
-    write(Report("grey", sets, [], {}, {"desk": example}), tmp_path)
-    for plot in ("calibration", "error_by_certainty"):
+    flat = Pixels(*np.full((3, 100), 3.2564103603363037, np.float32))  # whose logarithms round to falling ones
+    write(Report("grey", sets, [], {"desk": flat, "d200": flat}, {"desk": example}), tmp_path)
+    for plot in ("calibration", "error_by_certainty", "error_against_distance", "error_against_blur"):
         drawn = (tmp_path / f"{plot}.svg").read_text()
         assert [name for name in ("desk", "d200", "rgbd", "plane") if f"<!-- {name}" in drawn] == ["desk", "d200"]
+
+
+def test_a_report_of_a_set_without_an_answer_is_json(oracle: Examiner, tmp_path: Path) -> None:
+    outcome, _ = oracle.answer(case(1.0))
+    nothing = replace(outcome, depth=replace(outcome.depth, stated=np.full_like(outcome.depth.stated, np.inf)))
+    write(Report("grey", [summarise("dark", "gt", [nothing])], [], {}, {}), tmp_path)
+    (found,) = json.loads((tmp_path / "report.json").read_text(), parse_constant=pytest.fail)["sets"]
+    assert found["within"] == [None, None]
 
 
 def _no_picture() -> Iterator[Case]:
@@ -447,6 +456,7 @@ def test_procedural_scenes_come_with_both_truths(side: int) -> None:
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("data")
     write_photo(folder / "rgbd", "one", 900)
+    write_photo(folder / "rgbd", "blind", 0)
     write_photo(folder / "tabletop", "two", 700)
     write_photo(folder / "desk", "three", 0)  # no depth is known
     camera = {"focus_distance_m": 2.0, "k_cam_px": 3.0, "gamma_px": 0.5}
