@@ -2,6 +2,7 @@
 
 import pickle
 from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -32,13 +33,14 @@ class Checkpoint:
         }
         path.parent.mkdir(parents=True, exist_ok=True)
         scratch = path.with_suffix(".part")
+        whole = BytesIO()  # of a full disk torch itself does not say that it is full
+        torch.save(content, whole)
         try:
-            with scratch.open("wb") as file:
-                torch.save(content, file)
-            scratch.replace(path)
-        except (OSError, RuntimeError) as exc:  # torch's own of a full disk
+            scratch.write_bytes(whole.getbuffer())
+        except OSError as exc:
             scratch.unlink(missing_ok=True)
-            raise OSError(f"{path} cannot be written: {str(exc.__context__ or exc).splitlines()[0]}") from exc
+            raise OSError(f"{path} cannot be written: {exc.strerror}") from exc
+        scratch.replace(path)
 
     @classmethod
     def load(cls, path: Path) -> "Checkpoint":

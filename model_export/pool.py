@@ -31,6 +31,7 @@ LEAST_LIGHT = 0.2  # of a dimmed one
 GUESSED_GAMMA_SHARE, GUESSED_GAMMA = 0.6, (-0.2, 0.35)  # mean and standard deviation of the guess's log error
 HELD_OUT_SEED = (MOST_SEED + 1) * 2**32
 AHEAD = 64
+STOPS = (signal.SIGINT, signal.SIGTERM)
 
 Drawn = Sample | Negative
 
@@ -54,7 +55,8 @@ class SceneStream(Dataset[Drawn]):
 def _worker_start(_: int) -> None:
     one_core()
     os.nice(19)  # steps come first where cores are shared
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever stops a run stops its steps, which then save what they did
+    for number in STOPS:  # whoever stops a run stops its steps, which then save what they did
+        signal.signal(number, signal.SIG_IGN)
 
 
 def scene_stream(config: TrainConfig, material: Material, start: int, end: int, workers: int) -> Iterator[Drawn]:

@@ -24,13 +24,13 @@ from model_export.frames import load_frames
 from model_export.losses import Batch, run_pair, total_loss
 from model_export.networks import SHIPPED_WIDTHS, CompactDepth, Pair, Widths, make_pair, with_fresh_decoders
 from model_export.optimizers import Optimizers
-from model_export.pool import Pools, held_out
+from model_export.pool import STOPS, Pools, held_out
 from model_export.progress import progress_bar
 from model_export.scenes import Material
 from model_export.textures import load_photographs
 from service.cores import available_cores
 
-CHECKPOINT = "checkpoint.pt"
+CHECKPOINT, LOG = "checkpoint.pt", "log.txt"
 MOST_HELD_OUT = 32
 
 
@@ -117,13 +117,13 @@ class Trainer:
         self.teachers: list[Pair] = []
         self.recorded: dict[object, Recorded] = {}
         self.memory = torch.cuda.graph_pool_handle() if self.device.type == "cuda" else None  # one at a time uses it
-        self.step = 0
+        self.step, self.is_settled = 0, False
         if resume is not None:
             if not resume.optimizers:
                 raise ValueError("this checkpoint has no state to go on from: begin a new run with its --weights")
             self.modules.load_state_dict(resume.modules)
             self.optimizers.load_state_dict(resume.optimizers)
-            self.step = resume.step
+            self.step, self.is_settled = resume.step, resume.step > settling_step(resume.config)
 
     def begin_with(self, pair: Pair) -> None:
         """Take over other networks' weights."""
@@ -225,7 +225,7 @@ def config_of(run: Path, settings: Iterable[str]) -> TrainConfig:
 
 @contextmanager
 def _interruptible() -> Iterator[Event]:
-    """An event that says that the run was asked to stop (Ctrl-C), which it does after a step; asked again, at once."""
+    """An event that says that the run was asked to stop (Ctrl-C, SIGTERM): after its step, or, asked again, at once."""
     asked = Event()
     if current_thread() is not main_thread():
         yield asked
@@ -236,11 +236,12 @@ def _interruptible() -> Iterator[Event]:
             raise KeyboardInterrupt
         asked.set()
 
-    before = signal.signal(signal.SIGINT, ask)
+    before = {number: signal.signal(number, ask) for number in STOPS}
     try:
         yield asked
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class Pace:
@@ -317,7 +318,9 @@ def _step_to_end(trainer: Trainer, pools: Pools, test: Batch, path: Path, progre
         for said in _steps(trainer, pools, test, path):
             progress.update(task, completed=trainer.step)
             if said is not None:
-                progress.console.print(said)
+                progress.console.print(said, soft_wrap=True)
+                with (path.parent / LOG).open("a") as log:
+                    log.write(f"{said}\n")
             if asked.is_set() and trainer.step < trainer.config.steps:
                 raise _stopped(trainer, path, progress.console)
 
@@ -344,11 +347,13 @@ def _require_device(name: str) -> None:
 
 def _steps(trainer: Trainer, pools: Pools, test: Batch, path: Path) -> Iterator[str | None]:
     """Take the steps that a run has left, one at a time; what there is to say where a checkpoint was saved."""
-    config, pace = trainer.config, Pace()
+    config, pace, due = trainer.config, Pace(), settling_step(trainer.config)
     recent: list[dict[str, Tensor]] = []
+    is_settled = trainer.is_settled and trainer.step > due
     while trainer.step < config.steps:
-        if trainer.step == settling_step(config) > 0:
+        if trainer.step >= due > 0 and not is_settled:
             trainer.settle(pools.settling())
+            is_settled = True
         recent.append(trainer.advance(pools.batch(trainer.step)))
         with pace.waiting():
             pools.refresh(trainer.step - 1)
@@ -381,7 +386,6 @@ def _opened(
     config, widths = replace(config, taught=bool(teachers)), SHIPPED_WIDTHS
     if resume is not None:
         _require_onward(config, resume, path.parent)
-        config = replace(config, settled_share=resume.config.settled_share)
         changed = config.unlike(resume.config)
         if resume.step < config.steps:
             console.print(f"going on from step {resume.step}" + (f", with {', '.join(changed)}" if changed else ""))

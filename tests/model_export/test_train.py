@@ -122,6 +122,9 @@ def test_a_run_reports_and_ends_in_a_checkpoint(first_run: tuple[Path, str], fir
     assert first.config == CONFIG
     assert "step 3: loss" in said
     assert re.search("held-out scenes .* 4/4", said)
+    log = (first_run[0].parent / "log.txt").read_text()
+    assert [line.split(":")[0] for line in log.splitlines()] == ["step 3", "step 6"]
+    assert log.splitlines()[0] in said
     assert "held out" in said
     assert "scenes/s, waited" in said
 
@@ -149,12 +152,15 @@ def test_a_run_at_its_end_says_so_and_draws_nothing(
     assert said.replace("\n", "").startswith(f"{own_copy} is at its end: go on with more --steps, or begin")
 
 
-def test_an_interrupted_run_saves_what_it_did(textures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_a_run_that_is_stopped_saves_what_it_did(
+    textures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: signal.Signals
+) -> None:
     advance = Trainer.advance
 
     def interrupted(self: Trainer, batch: Batch) -> dict[str, torch.Tensor]:
         if self.step == 1:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(stop)
         return advance(self, batch)
 
     monkeypatch.setattr(Trainer, "advance", interrupted)
@@ -163,6 +169,30 @@ def test_an_interrupted_run_saves_what_it_did(textures: Path, tmp_path: Path, mo
     assert Checkpoint.load(tmp_path / "run" / CHECKPOINT).step == 2
     monkeypatch.undo()
     assert run(CONFIG, textures, tmp_path / "run")[0].step == CONFIG.steps
+
+
+def test_a_run_that_is_made_shorter_still_settles_its_norms(
+    textures: Path, first: Checkpoint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settled: list[int] = []
+    monkeypatch.setattr(Trainer, "settle", lambda self, _: settled.append(self.step))
+    longer = replace(CONFIG, steps=20)
+    assert settling_step(CONFIG) < 5 < settling_step(longer)
+    replace(first, config=longer, step=5).save(tmp_path / CHECKPOINT)
+    run(CONFIG, textures, tmp_path)
+    assert settled == [5]
+    replace(first, config=CONFIG, step=5).save(tmp_path / CHECKPOINT)
+    run(CONFIG, textures, tmp_path)
+    assert settled == [5]
+
+
+def test_a_checkpoint_that_finds_no_room_is_said_and_leaves_the_one_before(first: Checkpoint, tmp_path: Path) -> None:
+    first.save(tmp_path / CHECKPOINT)
+    (tmp_path / CHECKPOINT).with_suffix(".part").symlink_to("/dev/full")
+    with pytest.raises(OSError, match=r"checkpoint\.pt cannot be written: .*No space"):
+        first.save(tmp_path / CHECKPOINT)
+    assert [file.name for file in tmp_path.iterdir()] == [CHECKPOINT]
+    assert Checkpoint.load(tmp_path / CHECKPOINT).step == first.step
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut off", pickle.dumps({"steps": 3}, 2)])
@@ -247,14 +277,9 @@ def test_a_run_that_begins_with_weights_keeps_their_statistics(
     first_run: tuple[Path, str], first: Checkpoint, textures: Path, tmp_path: Path
 ) -> None:
     said = Console(file=StringIO())
-    for steps in (3, 6):  # the second time it goes on
-        path = train_here(
-            replace(CONFIG, seed=2, steps=steps),
-            textures,
-            tmp_path / "second",
-            weights=first_run[0] if steps == 3 else None,
-            console=said,
-        )
+    begun = replace(CONFIG, seed=2, steps=3)
+    train_here(begun, textures, tmp_path / "second", weights=first_run[0], console=said)
+    path = train_here(config_of(tmp_path / "second", ["steps=6"]), textures, tmp_path / "second", console=said)
     second = Checkpoint.load(path)
     assert second.step == 6
     for name, own in first.modules.items():
@@ -534,6 +559,7 @@ def test_a_checkpoint_of_another_version_says_so(own_copy: Path) -> None:
     path = own_copy / CHECKPOINT
     content = torch.load(path, weights_only=True)
     content["config"]["forgotten"] = 1
-    torch.save(content, path)
-    with pytest.raises(ValueError, match="another version"):
-        Checkpoint.load(path)
+    for config in (content["config"], {"width": 3}):  # the other is somebody else's
+        torch.save(content | {"config": config}, path)
+        with pytest.raises(ValueError, match="another version"):
+            Checkpoint.load(path)
