@@ -407,9 +407,10 @@ def blender(
             python = blender_environment.environment(environment)
             progress.update(task, description="rendering", total=len(edges) + len(rooms))
             cycles.render(python, [*edges, *rooms], raw, lambda _: progress.advance(task))
-    except (FileNotFoundError, RuntimeError) as exc:
+            progress.update(task, description="developing")
+            cycles.develop(raw, rooms, out)
+    except (OSError, ValueError, RuntimeError) as exc:
         raise _fail(str(exc)) from exc
-    cycles.develop(raw, rooms, out)
     table = Table("edge", "sigma px", "Cycles", "ours", "ours / Cycles")
     worst = 0.0
     for result in cycles.compare_edges(raw, edges):
@@ -444,7 +445,7 @@ def homes(
             due = furnished.due(out, rooms)
             progress.update(task, description="rendering", total=len(due) * furnished.VIEWS)
             furnished.render(python, models, textures, due, out, lambda _: progress.advance(task))
-    except (FileNotFoundError, RuntimeError) as exc:
+    except (OSError, ValueError, RuntimeError) as exc:
         raise _fail(str(exc)) from exc
     typer.echo(out)
 

@@ -115,11 +115,11 @@ class _Map:
 
 
 def require_fewer(pair: Pair, widths: Widths) -> None:
-    """Raise ``ValueError`` for widths that are larger than a pair's, or others at the finest or the coarsest level."""
+    """Raise ``ValueError`` for widths larger than a pair's, or 0, or others at the finest or the coarsest level."""
     own = Widths.of(pair.modules().state_dict())
     for has, wanted in ((own.blur, widths.blur), (own.depth, widths.depth)):
         ends = (has[0], has[-1]) == (wanted[0], wanted[-1])
-        if not ends or len(has) != len(wanted) or any(a < b for a, b in zip(has, wanted, strict=True)):
+        if not ends or len(has) != len(wanted) or not all(0 < b <= a for a, b in zip(has, wanted, strict=True)):
             raise ValueError(f"of {has} channels only those between the first and the last become fewer: not {wanted}")
 
 

@@ -38,7 +38,6 @@ def environment(folder: Path) -> Path:
     for command in ([base, "-m", "venv", str(folder)], [str(python), "-m", "pip", "install", "--quiet", BPY]):
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
-            shutil.rmtree(folder, ignore_errors=True)
             raise RuntimeError(f"{' '.join(command)} failed: {done.stderr.strip()[-500:]}")
     complete.touch()
     return python

@@ -49,14 +49,19 @@ class Furniture:
 def unpack(libraries: Path, out: Path) -> list[Furniture]:
     """The models of all ``*.sh3f`` files of a folder, unpacked; what stands on a floor and upright.
 
-    Raises ``FileNotFoundError`` if there is no library.
+    Raises ``FileNotFoundError`` if there is no library, ``ValueError`` for one that is damaged.
     """
     found = []
     for library in sorted(libraries.glob("*.sh3f")):
         folder = out / library.stem
         if not folder.is_dir():
-            with zipfile.ZipFile(library) as packed:
-                packed.extractall(folder)
+            part = folder.with_suffix(".part")
+            try:
+                with zipfile.ZipFile(library) as packed:
+                    packed.extractall(part)
+            except zipfile.BadZipFile as exc:
+                raise ValueError(f"{library} is damaged: {exc}") from exc
+            part.rename(folder)
         found += _models(folder)
     if not found:
         raise FileNotFoundError(f"no furniture (*.sh3f) in {libraries}: Debian's package sweethome3d-furniture has it")

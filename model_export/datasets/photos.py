@@ -73,7 +73,10 @@ def load_cameras(folder: Path, needed: Sequence[CameraPart]) -> dict[str, dict[C
 
 def read_image(path: Path) -> NDArray[np.uint8]:
     """An RGB picture uint8 [h,w,3]; ``ValueError`` if it cannot be read."""
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    try:
+        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    except cv2.error:  # of more than 2^30 pixels
+        image = None
     if image is None:
         raise ValueError(f"{path} is no picture that can be read here: make it a JPEG or PNG")
     return np.ascontiguousarray(image[:, :, ::-1], np.uint8)

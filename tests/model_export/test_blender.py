@@ -95,6 +95,18 @@ def test_a_worker_that_fails_is_said(tmp_path: Path) -> None:
         render(broken, rooms(1), tmp_path / "out")
 
 
+def test_an_environment_that_cannot_be_made_is_said_and_leaves_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken = tmp_path / "python3.11"
+    broken.write_text("#!/bin/sh\necho no room >&2\nexit 1\n")
+    broken.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(RuntimeError, match="no room"):
+        environment(tmp_path)
+    assert broken.exists()
+
+
 def test_a_missing_python_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(FileNotFoundError, match=r"python3\.11"):

@@ -51,6 +51,17 @@ def test_a_library_says_how_large_its_furniture_is(tmp_path: Path) -> None:
     assert Path(found.path).read_text() == "v 0 0 0\n"
 
 
+def test_a_library_that_was_unpacked_in_part_is_unpacked_again(tmp_path: Path) -> None:
+    packed = library(tmp_path / "in", catalogue()) / "Some.sh3f"
+    whole = packed.read_bytes()
+    packed.write_bytes(whole.replace(b"v 0 0 0", b"v 0 0 1"))  # after the catalogue
+    with pytest.raises(ValueError, match=r"Some\.sh3f is damaged: Bad CRC-32"):
+        unpack(tmp_path / "in", tmp_path / "out")
+    packed.write_bytes(whole)
+    (found,) = unpack(tmp_path / "in", tmp_path / "out")
+    assert Path(found.path).read_text() == "v 0 0 0\n"
+
+
 @pytest.mark.parametrize(
     "changes", [{"elevation": 40}, {"category": "Vehicles"}, {"doorOrWindow": "true"}, {"width": 500}, {"model": "/no"}]
 )

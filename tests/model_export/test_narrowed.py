@@ -75,8 +75,9 @@ def test_of_channels_that_say_different_things_the_sums_say_more_than_silence(ba
         Widths((16, 16, 16, 16), (16, 16, 16, 32)),
         Widths((8, 16, 16, 32), (16, 16, 16, 32)),
         Widths((16, 16, 32), (16, 16, 16, 32)),
+        Widths((16, 0, 16, 32), (16, 16, 16, 32)),
     ],
-    ids=["more", "fewer at the coarsest", "fewer at the finest", "fewer levels"],
+    ids=["more", "fewer at the coarsest", "fewer at the finest", "fewer levels", "none"],
 )
 def test_only_channels_between_the_finest_and_the_coarsest_level_become_fewer(widths: Widths, batch: Batch) -> None:
     with pytest.raises(ValueError, match="only those between"):

@@ -1,12 +1,14 @@
 """Photographs with depth, written and read."""
 
 import json
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from model_export.datasets.photos import Photo, filled, load_photos, save_photos, write_image
+from model_export.datasets.photos import Photo, filled, load_photos, read_image, save_photos, write_image
 
 PICTURE = np.random.default_rng(1).integers(0, 256, (48, 64, 3), np.uint8)
 
@@ -37,6 +39,16 @@ def test_depth_of_another_size_is_refused(tmp_path: Path) -> None:
     save_photos(tmp_path, [(Photo("a", PICTURE, np.ones((24, 32), np.float32)), {})])
     with pytest.raises(ValueError, match=r"32x24 pixels, its picture 64x48"):
         list(load_photos(tmp_path))
+
+
+def test_a_picture_that_is_too_large_to_read_is_named(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.png", PICTURE)
+    told = bytearray((tmp_path / "a.png").read_bytes())
+    told[16:24] = struct.pack(">II", 40_000, 30_000)
+    told[29:33] = struct.pack(">I", zlib.crc32(told[12:29]))
+    (tmp_path / "a.png").write_bytes(told)
+    with pytest.raises(ValueError, match=r"a\.png is no picture that can be read here"):
+        read_image(tmp_path / "a.png")
 
 
 def test_a_full_disk_is_told_of(tmp_path: Path) -> None:
