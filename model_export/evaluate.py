@@ -111,8 +111,8 @@ class Examiner:
             sides=_sides(case, told) if case.side == "auto" else None,
         )
         every = max(1, max(case.truth_m.shape) // EXAMPLE_PX)
-        shown = (case.image, case.truth_m, told.depth_m, told.sigma_m)
-        return outcome, Example(*(each[::every, ::every] for each in shown))
+        shown = (slice(None, None, every),) * 2
+        return outcome, Example(case.image[shown], case.truth_m[shown], told.depth_m[shown], told.sigma_m[shown])
 
     def _blur(self, case: Case) -> Pixels | None:
         """Lambda where the case knows it, at the middles of the cells of what a request would read."""

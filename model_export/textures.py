@@ -36,8 +36,9 @@ Image = NDArray[np.float32]
 
 
 def picture_files(folder: Path) -> list[Path]:
-    """All JPEG and PNG files below ``folder``, in a fixed order."""
-    return sorted(p for p in folder.rglob("*") if p.suffix.lower() in {".jpg", ".jpeg", ".png"})
+    """All JPEG and PNG files below ``folder`` but hidden ones, in a fixed order."""
+    files = (p for p in folder.rglob("*") if p.suffix.lower() in {".jpg", ".jpeg", ".png"})
+    return sorted(p for p in files if not p.name.startswith("."))
 
 
 def load_photographs(folder: Path) -> list[NDArray[np.uint8]]:

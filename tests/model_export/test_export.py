@@ -10,9 +10,11 @@ import onnxruntime
 import pytest
 import torch
 from numpy.typing import NDArray
+from typer.testing import CliRunner
 
 from model_export import quantized
 from model_export.card import record_scores
+from model_export.cli import commands
 from model_export.config import Kind, SceneConfig, TrainConfig
 from model_export.export import export_pair, source_commit
 from model_export.networks import CompactDepth, Pair, make_pair
@@ -189,3 +191,13 @@ def test_a_commit_is_named_only_where_the_code_is_in_it(tmp_path: Path) -> None:
     assert len(commit) == 40
     (tmp_path / "export.py").write_text("changed")
     assert source_commit(tmp_path) == f"{commit}+"
+
+
+@pytest.mark.parametrize(
+    "command", [["export", "--checkpoint", str(SHIPPED_MODEL)], ["bench"]], ids=lambda told: str(told[0])
+)
+def test_a_place_that_cannot_be_written_to_is_said_before_anything_is_done(tmp_path: Path, command: list[str]) -> None:
+    (tmp_path / "file").touch()
+    result = CliRunner().invoke(commands, [*command, "--out", str(tmp_path / "file" / "in" / "it")])
+    assert result.exit_code == 1
+    assert result.stderr.startswith("[Errno 20] Not a directory")

@@ -60,6 +60,7 @@ def test_what_is_plain_has_no_edge() -> None:
 
 def test_a_file_that_is_no_picture_is_named(tmp_path: Path) -> None:
     write_image(tmp_path / "good.png", PHOTOGRAPH)
+    (tmp_path / "._good.png").write_bytes(b"macOS'")
     assert len(load_photographs(tmp_path)) == 1
     (tmp_path / "bad.png").write_bytes(b"no picture")
     with pytest.raises(ValueError, match=r"bad\.png is no picture"):
