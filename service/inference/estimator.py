@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.inference.artifact import Interval, Manifest, ModelFolder
+from service.inference.border import Mask, black_border, continued
 from service.inference.cancellation import Cancellation
 from service.inference.copies import MAY_BE_SHARPER_PX, Read, blend
 from service.inference.depth_map import NO_ANSWER, DepthMap, Reading, decide, fraction, layers_at
@@ -64,7 +65,16 @@ class _Request:
     part: Part | None = None
     stopwatch: Stopwatch = field(default_factory=Stopwatch)
     sights: Sights | None = None  # of small copies, where they are read for more than one camera
+    border: Mask | None = None
     warnings: tuple[str, ...] = ()
+
+    def without_border(self) -> Self:
+        """The same of what is seen, continued into a black border."""
+        border = black_border(self.rgb)
+        if border is None:
+            return self
+        said = f"a black border, {fraction(border):.0%} of the photograph, shows nothing: no answer there"
+        return replace(self, rgb=continued(self.rgb, border), border=border, warnings=(*self.warnings, said))
 
     def area(self, scale: float, multiple: int) -> Part:
         """What a copy of this scale shows: the photograph, or the part and what the copy needs around it.
@@ -128,7 +138,8 @@ class Estimator:
         height, width = rgb.shape[:2]
         if (width, height) != (camera.image_width_px, camera.image_height_px):
             raise ValueError(f"the camera must be that of a {width}x{height} image: resize it first")
-        request, clues = self._heard(_Request(rgb, camera, side, cancellation or Cancellation(), part), known)
+        asked = _Request(rgb, camera, side, cancellation or Cancellation(), part)
+        request, clues = self._heard(asked.without_border(), known)
         request, read = self._read_sharp(request)
         area, stopwatch = read.area, request.stopwatch
         size = (area.height_px, area.width_px)
@@ -214,6 +225,8 @@ class Estimator:
         def reading() -> Reading:
             answer = Reading.of(read.maps, read.camera, size, self.manifest, request.side, read.most_blur_px)
             settle(answer, limits_m, read.stride, max(request.rgb.shape[:2]) * read.scales[0])
+            if request.border is not None:
+                answer.leave_out(read.area.of(request.border))
             return answer.at_focus(request.camera.focus_distance_m, farthest * request.camera.focus_distance_m)
 
         if _is_blank(request.rgb):

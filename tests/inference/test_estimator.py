@@ -194,6 +194,25 @@ def test_of_a_dark_photograph_with_something_in_it_that_is_answered(estimator: E
     assert estimator.estimate(dark, CAMERA).valid.all()
 
 
+@pytest.mark.parametrize("part", [None, Part(0, 8, 96, 40), Part(20, 8, 60, 40)])
+@pytest.mark.parametrize("k_cam_px", [6.0, 48.0])  # read as it is, and on a smaller copy
+def test_a_black_border_is_not_answered_and_changes_no_answer(
+    estimator: Estimator, part: Part | None, k_cam_px: float
+) -> None:
+    camera, picture = replace(CAMERA, k_cam_px=k_cam_px), grey(60)
+    picture[:, 72:] = 130
+    plain = estimator.estimate(picture, camera, "near", part=part)
+    picture[:, :24] = 0
+    answer = estimator.estimate(picture, camera, "near", part=part)
+    hidden = max(0, 24 - (part.left if part else 0))
+    assert not answer.valid[:, : hidden - 2].any()
+    np.testing.assert_allclose(answer.depth_m[:, hidden + 4 :], plain.depth_m[:, hidden + 4 :], rtol=1e-5)
+    assert answer.warnings == (
+        "a black border, 25% of the photograph, shows nothing: no answer there",
+        *plain.warnings,
+    )
+
+
 @pytest.mark.parametrize("side", ["auto", "near"])
 def test_relative_defocus_of_one_and_more_is_near(estimator: Estimator, side: Side) -> None:
     level = 200
