@@ -58,9 +58,10 @@ def continued(rgb: NDArray[np.uint8], border: Mask) -> NDArray[np.uint8]:
         return rgb
     height, width = hidden.shape
     _, labels = cv2.distanceTransformWithLabels(hidden.astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    seen = np.flatnonzero(~hidden)
     place_of = np.zeros(int(labels.max()) + 1, np.int32)
-    place_of[labels.ravel()[seen]] = seen
+    for rows in bands(hidden.shape):
+        down, across = np.nonzero(~hidden[rows])
+        place_of[labels[rows][down, across]] = (down + rows.start) * width + across
     filled = rgb.copy()
     for rows in bands(hidden.shape):
         down, across = np.nonzero(hidden[rows])
