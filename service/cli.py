@@ -79,6 +79,7 @@ def serve(
     Exit codes: 0 after SIGTERM, SIGINT or SIGHUP, once what was asked is answered; 143 or 130 where a second one did
     not wait for that; 1 where it cannot start (the address, the model, the database); 2 for a wrong setting.
     """
+    _end_in_order(0)
     settings = _settings(host=host, port=port, model_dir=model)
     with lasting():
         from service import logs, server
@@ -520,11 +521,14 @@ def revoke_key(key_id: Annotated[str, typer.Argument(help="As `camind keys list`
     typer.echo(f"Key {key.id} ({key.name}) is refused from now on.")
 
 
-def _end_in_order() -> None:
-    """Let signals that would end the process at once end it as an error does: no half of a database is left behind."""
+def _end_in_order(code: int | None = None) -> None:
+    """Let signals that would end the process at once end it as an error does, with ``code`` or as a shell tells it.
+
+    No half of a database is left behind; and a container's first process is not told of signals it has no handler for.
+    """
     for number in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is signal.SIG_DFL:
-            signal.signal(number, lambda number, _: sys.exit(128 + number))
+            signal.signal(number, lambda number, _: sys.exit(128 + number if code is None else code))
 
 
 def _drop_unwritten() -> None:

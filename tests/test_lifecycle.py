@@ -166,6 +166,23 @@ def test_an_app_that_does_not_start_ends_with_1(tmp_path: Path, tiny_model_dir: 
     assert told.endswith("camind did not start: the log above says why.\n")
 
 
+def test_a_stop_is_heard_before_it_serves(tmp_path: Path) -> None:
+    manifest = tmp_path / "model" / "manifest.json"
+    manifest.parent.mkdir()
+    os.mkfifo(manifest)
+    environment = {**os.environ, "CAMIND_DATA_DIR": str(tmp_path / "data")}
+    command: list[str | Path] = [CAMIND, "serve", "--port", "0", "--model", manifest.parent]
+    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            with manifest.open("w"):  # which waits until it is about to be read
+                process.terminate()
+                told = process.communicate(timeout=30)[1]
+        finally:
+            process.kill()
+    # by a handler of its own: without one a container's first process goes on
+    assert (process.returncode, told) == (0, "")
+
+
 def test_a_running_service_is_backed_up_and_not_restored(server: Server, tmp_path: Path) -> None:
     def camind(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
         environment = {**os.environ, "CAMIND_DATA_DIR": str(tmp_path / "data")}
