@@ -67,9 +67,14 @@ def _open_postgresql(url: URL) -> Engine:
     except ImportError as exc:
         raise NotReady("What speaks to PostgreSQL is not installed: pip install 'camind[postgres]'.") from exc
 
-    arguments = postgresql.connect_args(url)
     engine = create_engine(
-        url, pool_timeout=POOL_TIMEOUT_S, pool_pre_ping=True, hide_parameters=True, connect_args=arguments
+        url,
+        pool_timeout=POOL_TIMEOUT_S,
+        pool_pre_ping=True,
+        hide_parameters=True,
+        # whatever the server's default: who waited for a row's lock goes on with what is there then
+        isolation_level="READ COMMITTED",
+        connect_args=postgresql.connect_args(url),
     )
     postgresql.bound(engine)
     return engine

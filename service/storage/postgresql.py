@@ -17,6 +17,8 @@ STATEMENT_TIMEOUT_MS = 8_000
 # the server's own limits come first; this one is for a server that stands still
 ANSWER_TIMEOUT_S = 10.0
 CONNECT = {
+    # a server that was set up without a locale says SQL_ASCII, for which psycopg gives bytes
+    "client_encoding": "utf8",
     "connect_timeout": 5,
     "tcp_user_timeout": 10_000,
     "keepalives_idle": 5,
@@ -45,9 +47,10 @@ class BoundedConnection(psycopg.Connection[Any]):
 
 def connect_args(url: URL) -> dict[str, Any]:
     """What psycopg is told beside the URL, whose own parameters win."""
-    limits = f"-c lock_timeout={LOCK_TIMEOUT_MS} -c statement_timeout={STATEMENT_TIMEOUT_MS}"
+    # psycopg reads dates of no other style
+    told = f"-c lock_timeout={LOCK_TIMEOUT_MS} -c statement_timeout={STATEMENT_TIMEOUT_MS} -c datestyle=ISO"
     given = url.query.get("options", "")
-    options = " ".join([limits, *([given] if isinstance(given, str) else given)])
+    options = " ".join([told, *([given] if isinstance(given, str) else given)])
     return {**{name: value for name, value in CONNECT.items() if name not in url.query}, "options": options}
 
 

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from uuid import uuid4
@@ -20,6 +21,7 @@ from service.storage import postgresql, schema
 from service.storage.backup import using
 from service.storage.cameras import Cameras
 from service.storage.engine import journal_mode, open_engine, reading, require_writable, writing
+from service.storage.seeds import seed_drafts
 from service.storage.spool import Spool
 from service.storage.tables import CameraRevisionRow
 
@@ -225,6 +227,23 @@ def test_a_migration_waits_as_long_as_it_takes(hurried: Engine) -> None:
     other.close()
     with pytest.raises(Busy), reading(hurried) as session:
         session.connection().exec_driver_sql("SELECT pg_sleep(30)")
+
+
+def test_what_a_server_is_used_to_is_no_matter(postgres_url: str) -> None:
+    server = open_engine(postgres_url)
+    name = f"{server.url.database}_ascii"
+    with server.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
+        connection.exec_driver_sql(f"CREATE DATABASE {name} TEMPLATE template0 ENCODING 'SQL_ASCII' LOCALE 'C'")
+        connection.exec_driver_sql(f"ALTER DATABASE {name} SET datestyle = 'German'")
+        connection.exec_driver_sql(f"ALTER DATABASE {name} SET default_transaction_isolation = 'serializable'")
+    engine = open_engine(server.url.set(database=name))
+    schema.upgrade(engine)
+    draft = replace(seed_drafts()[0], description="Küche")
+    assert Cameras(engine).add(draft) == Cameras(engine).get(draft.name)
+    with engine.connect() as connection:
+        assert connection.exec_driver_sql("SHOW transaction_isolation").scalar() == "read committed"
+    engine.dispose()
+    server.dispose()
 
 
 def test_a_url_s_own_parameters_win(postgres_url: str) -> None:
