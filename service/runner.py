@@ -84,7 +84,6 @@ class Runner:
         self._limits = limits
         self._calibrate = calibrate
         self._count_problem = count_problem
-        self._is_ready = False
         self._gave_up_s = -GIVE_UP_S
         self._wake = threading.Event()
         self._stop = threading.Event()
@@ -124,9 +123,8 @@ class Runner:
         """Run the next calibration; False where there is none, or another process works this spool off."""
         if not self._spool.acquire():
             return False
-        if not self._is_ready:
-            self._calibrations.recover(self._spool.id)
-            self._is_ready = True
+        # whatever runs by the database's word, nobody works on it
+        self._calibrations.recover(self._spool.id)
         if time.monotonic() - self._gave_up_s >= GIVE_UP_S:
             self._calibrations.give_up(self._spool.id)
             self._gave_up_s = time.monotonic()
@@ -134,8 +132,8 @@ class Runner:
         record = self._calibrations.take(self._spool.id)
         if record is None:
             return False
-        if self._end_of(record):
-            self._spool.remove(record.id)
+        self._bring_to_end(record)
+        self._sweep()
         return True
 
     def _sweep(self) -> None:
@@ -145,22 +143,24 @@ class Runner:
         for calibration_id in set(ids) - self._calibrations.live(ids):
             self._spool.remove(calibration_id)
 
-    def _end_of(self, record: CalibrationRecord) -> bool:
-        """Bring a calibration to its end; False where it is left for the next start."""
+    def _bring_to_end(self, record: CalibrationRecord) -> None:
+        """Work on a calibration until it has ended, or leave it for later: where the service stops, and where the
+        database forgot that it was begun, as one may that was put in another's place.
+        """
         with structlog.contextvars.bound_contextvars(calibration=record.id):
             try:
                 ending = self._worked(record)
             except Cancelled:
                 if self._stop.is_set():
-                    return not self._calibrations.put_back(record.id)
-                return True
+                    self._calibrations.put_back(record.id)
+                return
             except Exception:
                 log.exception("calibration_failed")
                 self._count_problem(CamindError.code)
                 ending = Ending(
                     "failed", problem="Something went wrong here; the log has it under the calibration's id."
                 )
-            return self._insist(lambda: self._calibrations.finish(record.id, ending))
+            self._insist(lambda: self._calibrations.finish(record.id, ending))
 
     def _worked(self, record: CalibrationRecord) -> Ending:
         paths = self._spool.paths(record.id, len(record.draft.pictures))
@@ -181,8 +181,8 @@ class Runner:
     def _loader(self, path: Path) -> Callable[[], NDArray[np.uint8]]:
         return lambda: read_stored_frame(path.read_bytes(), self._limits)
 
-    def _insist(self, write: Callable[[], object]) -> bool:
-        """Write until the database takes it; False where the service stops before."""
+    def _insist(self, write: Callable[[], object]) -> None:
+        """Write until the database takes it or the service stops."""
         while True:
             try:
                 write()
@@ -190,9 +190,9 @@ class Runner:
                 cause = repr(exc.__cause__)
                 log.warning("calibration_waits_for_the_database", detail=exc.detail, cause=cause)
             else:
-                return True
+                return
             if self._stop.wait(RETRY_S):
-                return False
+                return
 
 
 class _Progress:

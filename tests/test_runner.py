@@ -16,13 +16,13 @@ from sqlalchemy import Engine
 
 from service.calibration.fit import Interval
 from service.calibration.report import Result
-from service.errors import Busy
+from service.errors import Busy, NotReady
 from service.inference.images import ImageLimits
 from service.runner import MOST_ATTEMPTS, Calibrate, Runner
 from service.storage import schema
 from service.storage.calibrations import CalibrationDraft, CalibrationRecord, Calibrations, Ending, StoredPicture
 from service.storage.cameras import Cameras
-from service.storage.engine import open_engine
+from service.storage.engine import open_engine, writing
 from service.storage.spool import Spool, picture_file
 from tests.fake_calibration import RESULT, SETTINGS, FakeCalibration, without_calibrations
 from tests.inference.photographs import corners, jpeg, png
@@ -297,6 +297,56 @@ def test_a_busy_database_costs_time_and_nothing_else(engine: Engine, spool: Spoo
     record = bench.ended(calibration_id)
     runner.close()
     assert (record.state, record.camera_revision) == ("succeeded", 1)
+
+
+class Severed(Calibrations):
+    """A database whose connection ends between the first commit and the word of it."""
+
+    is_severed = False
+
+    def take(self, spool: str) -> CalibrationRecord | None:
+        record = super().take(spool)
+        if record is not None and not self.is_severed:
+            self.is_severed = True
+            raise NotReady("The database cannot be used: the service's log says why.")
+        return record
+
+
+def test_what_was_begun_and_not_told_of_is_begun_again(engine: Engine, spool: Spool) -> None:
+    bench = Bench(Severed(engine), spool)
+    calibration_id = bench.queue(png(corners()))
+    runner = bench.run(FakeCalibration())
+    bench.until(lambda: bench.calibrations.get(calibration_id).state == "running")
+    time.sleep(0.1)
+    runner.wake()
+    assert bench.ended(calibration_id).state == "succeeded"
+    runner.close()
+
+
+@pytest.mark.parametrize("has_ended", [False, True])
+def test_what_the_database_forgot_was_begun_is_begun_again(bench: Bench, engine: Engine, *, has_ended: bool) -> None:
+    """As after a failover: the one that takes over may lack the last writes."""
+    calibration_id = bench.queue(png(corners()))
+
+    def forget() -> None:
+        with writing(engine) as session:
+            session.connection().exec_driver_sql("UPDATE calibrations SET state = 'queued', attempts = 0")
+
+    def outcome() -> Result:
+        if has_ended and len(fake.tasks) == 1:
+            forget()
+        return RESULT
+
+    fake = FakeCalibration(outcome, is_held=not has_ended)
+    bench.run(fake)
+    if not has_ended:
+        assert fake.has_begun.wait(PATIENCE_S)
+        forget()
+        bench.until(lambda: len(fake.tasks) == 2)
+        fake.go.set()
+    assert bench.ended(calibration_id).state == "succeeded"
+    assert len(fake.tasks) == 2
+    bench.until(lambda: bench.spool.ids() == [])
 
 
 def test_the_log_says_why_calibrations_wait_for_the_database(bench: Bench, engine: Engine) -> None:

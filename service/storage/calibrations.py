@@ -252,7 +252,9 @@ class Calibrations:
             return before
 
     def recover(self, spool: str) -> None:
-        """What the spool's last run left running is queued again."""
+        """What the spool's last run left running is queued again; where there is nothing, that costs no lock."""
+        if not self.live_counts(spool)["running"]:
+            return
         now = datetime.now(UTC)
         again = (
             update(CalibrationRow)
