@@ -142,6 +142,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
 
 def _start(app: FastAPI) -> None:
     settings: Settings = app.state.settings
+    schema.head_revision()  # from here on
     engine = open_engine(settings.effective_database_url)
     if settings.is_database_embedded:
         schema.upgrade(engine)

@@ -125,7 +125,12 @@ def unhurried(connection: Connection) -> Iterator[None]:
 
 
 def require_writable(engine: Engine) -> None:
-    """Raise ``NotReady`` where the database takes no writes: a full disk, a read-only file or replica."""
+    """Raise ``NotReady`` where the database takes no writes: a full disk, a read-only file or replica.
+
+    And where it keeps none, as a file that was removed, or replaced without a restart.
+    """
+    if engine.dialect.name == "sqlite" and _is_removed(str(engine.url.database)):
+        raise NotReady("The database's file was removed or replaced: what is stored now is lost, until a restart.")
     try:
         with writing(engine) as session:
             session.connection().exec_driver_sql("UPDATE cameras SET revision = revision WHERE id = -1")
@@ -135,6 +140,16 @@ def require_writable(engine: Engine) -> None:
                 session.rollback()
     except InsufficientStorage as exc:
         raise NotReady(exc.detail) from exc
+
+
+def _is_removed(file: str) -> bool:
+    """Whether this process has a file open that had this name; Linux alone tells."""
+    removed = Path(f"{os.path.realpath(file)} (deleted)")
+    for descriptor in Path("/proc/self/fd").glob("*"):
+        with suppress(OSError):
+            if descriptor.readlink() == removed:
+                return True
+    return False
 
 
 def _prepare_sqlite(connection: sqlite3.Connection, _: ConnectionPoolEntry) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 from alembic import command
@@ -21,8 +22,9 @@ VERSION_TABLE = "alembic_version"
 LOCK = 0x63616D696E64
 
 
+@cache
 def head_revision() -> str | None:
-    """The newest migration this code knows."""
+    """The newest migration this code knows: those of a later version may be installed while it runs."""
     return ScriptDirectory.from_config(_config()).get_current_head()
 
 

@@ -1,14 +1,17 @@
 """Health, the model that answers, and what a restart keeps."""
 
 import json
+import shutil
 from pathlib import Path
 
+import pytest
 from fastapi import FastAPI
 from sqlalchemy import event
 from starlette.testclient import TestClient
 
+import migrations
 from service.app import create_app
-from service.config import Settings
+from service.config import DATABASE_FILE, Settings
 from service.storage import schema
 
 
@@ -31,6 +34,27 @@ def test_an_old_schema_is_not_ready(client: TestClient, app: FastAPI) -> None:
     assert answer.headers["content-type"] == "application/problem+json"
     assert "camind migrate" in answer.json()["detail"]
     assert client.get("/health/live").status_code == 200
+
+
+def test_a_later_version_that_is_installed_meanwhile_changes_nothing(
+    app: FastAPI, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    installed = Path(shutil.copytree(Path(migrations.__file__).parent, tmp_path / "later"))
+    later = f"revision, down_revision = 'later', {schema.head_revision()!r}\n"
+    schema.head_revision.cache_clear()
+    with TestClient(app) as client:
+        (installed / "versions" / "later.py").write_text(later)
+        monkeypatch.setattr(migrations, "__file__", str(installed / "__init__.py"))
+        assert client.get("/health/ready").status_code == 200
+
+
+def test_a_database_that_was_replaced_is_not_ready(client: TestClient, settings: Settings) -> None:
+    database = settings.data_dir / DATABASE_FILE
+    assert client.get("/health/ready").status_code == 200
+    Path(shutil.copy(database, settings.data_dir / "copy")).replace(database)
+    answer = client.get("/health/ready")
+    assert (answer.status_code, answer.json()["type"]) == (503, "urn:camind:problem:not-ready")
+    assert "replaced" in answer.json()["detail"]
 
 
 def test_a_database_that_takes_no_writes_is_not_ready(client: TestClient, app: FastAPI) -> None:
