@@ -147,8 +147,8 @@ class EndConnections:
     """Ends a connection where what comes next on it could be taken wrongly, and ends none before the answer is through.
 
     An answer says ``Connection: close`` where the body had two lengths (RFC 9112, 6.1), where the client waits for
-    ``100 Continue`` and may send the body or another request, and where the service stops. Before a connection is
-    closed, what still comes of the body is thrown away, for ``deadline_s`` at most: a reset would take the answer along.
+    ``100 Continue`` and may send the body or another request, and where the service stops. What still comes of the body
+    is thrown away before a connection is closed, for ``deadline_s`` at most: a reset would take the answer along.
     """
 
     def __init__(self, app: ASGIApp, deadline_s: float) -> None:
