@@ -24,6 +24,7 @@ ENV PATH=/opt/camind/bin:$PATH \
 USER 10001
 VOLUME /data
 EXPOSE 8000
-HEALTHCHECK --interval=30s --timeout=3s --start-period=20s CMD ["python3", "-c", "import os, urllib.request as u; u.urlopen('http://127.0.0.1:' + os.environ['CAMIND_PORT'] + '/health/ready', timeout=2)"]
+# by no proxy, which Docker may have set for all containers
+HEALTHCHECK --interval=30s --timeout=3s --start-period=20s CMD ["python3", "-c", "import os, urllib.request as u; u.build_opener(u.ProxyHandler({})).open('http://127.0.0.1:' + os.environ['CAMIND_PORT'] + '/health/ready', timeout=2)"]
 ENTRYPOINT ["camind"]
 CMD ["serve"]

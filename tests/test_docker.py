@@ -91,5 +91,6 @@ def test_the_service_runs_as_nobody_in_particular() -> None:
 def test_health_is_asked_for_at_the_port_that_is_set(tmp_path: Path, tiny_model_dir: Path) -> None:
     command: list[str] = json.loads(dict(stage(SERVICE, 1))["HEALTHCHECK"].partition("CMD ")[2])
     with serving(tmp_path / "data", "--model", tiny_model_dir) as server:
-        environment = {**os.environ, "CAMIND_PORT": str(server.port)}
+        nobody = "http://127.0.0.1:9"
+        environment = {**os.environ, "CAMIND_PORT": str(server.port), "http_proxy": nobody, "no_proxy": ""}
         subprocess.run([sys.executable, *command[1:]], env=environment, check=True)

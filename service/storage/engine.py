@@ -143,13 +143,13 @@ def require_writable(engine: Engine) -> None:
 
 
 def _is_removed(file: str) -> bool:
-    """Whether this process has a file open that had this name; Linux alone tells."""
+    """Whether nothing has this name, or this process has a file open that had it; Linux alone tells that."""
     removed = Path(f"{os.path.realpath(file)} (deleted)")
     for descriptor in Path("/proc/self/fd").glob("*"):
         with suppress(OSError):
             if descriptor.readlink() == removed:
                 return True
-    return False
+    return not Path(file).exists()
 
 
 def _prepare_sqlite(connection: sqlite3.Connection, _: ConnectionPoolEntry) -> None:

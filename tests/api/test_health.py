@@ -48,10 +48,14 @@ def test_a_later_version_that_is_installed_meanwhile_changes_nothing(
         assert client.get("/health/ready").status_code == 200
 
 
-def test_a_database_that_was_replaced_is_not_ready(client: TestClient, settings: Settings) -> None:
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_database_that_was_replaced_is_not_ready(client: TestClient, settings: Settings, *, is_there: bool) -> None:
     database = settings.data_dir / DATABASE_FILE
     assert client.get("/health/ready").status_code == 200
-    Path(shutil.copy(database, settings.data_dir / "copy")).replace(database)
+    if is_there:
+        Path(shutil.copy(database, settings.data_dir / "copy")).replace(database)
+    else:
+        database.rename(settings.data_dir / "elsewhere")
     answer = client.get("/health/ready")
     assert (answer.status_code, answer.json()["type"]) == (503, "urn:camind:problem:not-ready")
     assert "replaced" in answer.json()["detail"]
