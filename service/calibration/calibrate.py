@@ -11,8 +11,9 @@ from threadpoolctl import threadpool_limits
 
 from service.calibration import fit
 from service.calibration.edge import PointSpread, find_spread, fit_again
-from service.calibration.measure import LEAST_CIRCLES, Measured, ill_exposed, measure, otherwise_sized
+from service.calibration.measure import LEAST_CIRCLES, Measured, ill_exposed, measure, otherwise_sized, too_blurred
 from service.calibration.pose import Placement, PoseError, place
+from service.calibration.refocus import refocused
 from service.calibration.report import Method, PictureReport, Report, Result, Role, Sample
 from service.calibration.solve import FEW_VIEWS
 from service.calibration.target import CircleGrid
@@ -147,9 +148,11 @@ def _result(task: Task, measured: list[Measured], at: Callable[[float], None]) -
         warnings=(
             *_left_out(measured, usable),
             *ill_exposed(measured),
+            *too_blurred(usable),
             *otherwise_sized(usable),
             *placement.warnings,
             *constants.warnings,
+            *(refocused(circles, constants) if task.method == "edge" else ()),
             *_uneven(corners),
         ),
     )

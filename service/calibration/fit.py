@@ -189,7 +189,7 @@ def _doubt(circles: Circles, given_m: float, fit: Fit, depth_error: float) -> tu
 def odd_pictures(circles: Circles, constants: Constants) -> list[int]:
     """The pictures of which most circles are outliers, and as far off as no curve may be."""
     found = np.array([constants.k_cam_px.value, constants.gamma_px.value, constants.focus_distance_m.value])
-    off = np.abs(_model(found, circles) / circles.blur_px - 1)
+    off = np.abs(blur_of(found, circles) / circles.blur_px - 1)
     return [
         int(picture)
         for picture in np.unique(circles.picture)
@@ -246,20 +246,21 @@ def _constants(circles: Circles, fit: Fit, focus_m: float | None, depth_error: f
         k_cam_px=k_cam,
         gamma_px=gamma,
         focus_distance_m=focus,
-        rms_px=float(np.sqrt(np.mean((_model(best, circles) - circles.blur_px) ** 2))),
+        rms_px=float(np.sqrt(np.mean((blur_of(best, circles) - circles.blur_px) ** 2))),
         is_outlier=np.abs(rest) > OUTLIER * scale,
         curve=tuple(_curve(circles.depth_m, best, drawn, widen)),
         warnings=tuple(_warnings(circles, (k_cam, gamma, focus), is_focus_given=focus_m is not None)),
     )
 
 
-def _model(constants: Array, circles: Circles) -> Array:
+def blur_of(constants: Array, circles: Circles) -> Array:
+    """The blur [n] that k_cam, gamma and focus distance give the circles."""
     return np.asarray(thin_lens.blur_from_defocus(constants[0] * circles.excess(constants[2]), constants[1]))
 
 
 def _left_over(constants: Array, circles: Circles) -> Array:
     error = np.sqrt(circles.blur_error_px**2 + FLOOR_PX**2 + (FLOOR_PART * circles.blur_px) ** 2)
-    return np.asarray((_model(constants, circles) - circles.blur_px) / error)
+    return np.asarray((blur_of(constants, circles) - circles.blur_px) / error)
 
 
 def _fitted(circles: Circles, focus_m: float | None, start: Array | None) -> Array:
@@ -305,9 +306,9 @@ def _resampled(circles: Circles, fit: Fit, best: Array, focus_m: float | None, d
     """
     rng = np.random.default_rng(0)
     focus_error = 0.0 if focus_m is not None else FOCUS_ERROR
-    shown = replace(circles, blur_px=_model(best, circles))
+    shown = replace(circles, blur_px=blur_of(best, circles))
     _, number = np.unique(circles.picture, return_inverse=True)
-    errors, offset = _errors(circles, shown.blur_px, number)
+    errors, offset = errors_of(circles, shown.blur_px, number)
     doublings = np.log2(shown.blur_px / np.median(shown.blur_px))
     rows = []
     for _ in range(count):
@@ -322,7 +323,7 @@ def _resampled(circles: Circles, fit: Fit, best: Array, focus_m: float | None, d
     return np.array(rows)
 
 
-def _errors(circles: Circles, shown_px: Array, number: NDArray[np.int64]) -> tuple[tuple[float, float, float], Array]:
+def errors_of(circles: Circles, shown_px: Array, number: NDArray[np.int64]) -> tuple[tuple[float, float, float], Array]:
     """Relative errors of blur: of a picture's, of how it changes over its depths, of a circle's; and those depths [n].
 
     The depths are in standard deviations of each picture's. A curve that is laid through few pictures leaves none of
@@ -388,7 +389,7 @@ def _warnings(circles: Circles, found: tuple[Interval, Interval, Interval], *, i
             if is_focus_given
             else f"the pictures do not separate k_cam_px and focus_distance_m well, see their intervals: {BETTER}"
         )
-    model = _model(np.array([k_cam.value, gamma.value, focus.value]), circles)
+    model = blur_of(np.array([k_cam.value, gamma.value, focus.value]), circles)
     off = float(np.median(np.abs(model / circles.blur_px - 1)))
     if off > MISFIT:
         told.append(

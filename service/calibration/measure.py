@@ -20,6 +20,7 @@ CLIPPED_LEVEL = 252
 DARK_LEVEL = 80  # of the paper: below, noise is a large part of the circles' contrast
 PLATEAU, PLATEAU_CIRCLES, LEAST_PLATEAU = 0.7, 0.5, 160  # of the paper at one level, of the circles so, from where on
 CLIPPED_CIRCLES = 0.1  # of a picture's, from where on it is overexposed
+FAR_RADII = 0.45  # of blur: circles of half a radius read up to 4 % wrong, of two thirds a third, one side or the other
 OTHER_SIZE = 1.1  # paper shrinks and ink spreads less
 PAPER_FROM_RADII, PAPER_TO_RADII = 1.3, 1.6
 LUMINANCE = (0.2126, 0.7152, 0.0722)
@@ -47,6 +48,13 @@ class Measured:
     def is_clipped(self) -> bool:
         clipped = sum(level >= CLIPPED_LEVEL for level in self.paper_levels)
         return clipped > CLIPPED_CIRCLES * len(self.paper_levels)
+
+    @property
+    def blur_radii(self) -> float:
+        """How large the blur is beside the circles; 0 of none."""
+        if self.grid is None or not self.edges:
+            return 0.0
+        return float(np.median([edge.blur_px for edge in self.edges]) / np.median(self.grid.radii_px[self.circles]))
 
     def view(self) -> View:
         return View(np.array(self.circles, np.int64), np.array(self.centres_px, np.float64))
@@ -87,6 +95,18 @@ def ill_exposed(measured: Sequence[Measured]) -> tuple[str, ...]:
             f"{clipped} of {len(shown)} photographs are overexposed: what is left of their circles looks sharper"
         )
     return tuple(told)
+
+
+def too_blurred(measured: Sequence[Measured]) -> tuple[str, ...]:
+    """A warning where most photographs are too far out of focus, beside what is said of each."""
+    shown = [one for one in measured if one.edges]
+    far = sum(one.blur_radii > FAR_RADII for one in shown)
+    if 2 * far <= len(shown):
+        return ()
+    return (
+        f"{far} of {len(shown)} photographs are too far out of focus for their circles, which falsifies k_cam_px and "
+        "focus_distance_m",
+    )
 
 
 def measure(
@@ -157,6 +177,11 @@ def _measure_circles(
         out.edges.append(edge)
     _warn_of_plateau(out)
     _warn_of_dark(out)
+    if out.blur_radii > FAR_RADII:
+        out.warn(
+            f"its circles are blurred by {out.blur_radii:.2f} of their radius, where blur is misread: go no farther "
+            "from focus than where it is a third, or take a sheet of larger circles"
+        )
     for reason, count in reasons.most_common(3):
         out.warn(f"{count} of {len(chosen)} circles not measured: {reason}")
     if every == 1 and 0 < len(out.circles) < LEAST_CIRCLES:

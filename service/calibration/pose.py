@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.calibration.solve import CRITERIA, FEW_VIEWS, Solved, focal_error, solve
+from service.calibration.solve import CRITERIA, FEW_VIEWS, FREE_VIEWS, Solved, focal_error, solve, solve_with_sheet
 from service.calibration.target import CircleGrid
 from service.opencv import cv2
 from service.optics.camera import Intrinsics
@@ -18,7 +18,7 @@ RIM_POINTS = 48
 LEAST_VIEWS = 2
 LITTLE_TILT_DEG = 8.0
 BAD_RMS_PART = 0.008  # of the spacing
-FREE_VIEWS, CLEARLY = 6, 0.75
+CLEARLY = 0.75
 TELL_BENT_PART = 0.025  # of the spacing
 MOST_FOCAL_ERROR = 0.1
 NEAR_M = 0.01  # all sheets nearer than that: their spacing may have been told in metres
@@ -70,7 +70,7 @@ def place(grid: CircleGrid, views: Sequence[View], size_px: tuple[int, int]) -> 
         solved = _solved(flat, views, centres, size_px)
         centres = [view.centres_px - _bias(flat, grid, view, solved, i) for i, view in enumerate(views)]
     solved = _solved(flat, views, centres, size_px)
-    board, solved = _freed(flat, grid, views, centres, size_px, solved)
+    board, solved, error = _freed(flat, grid, views, centres, size_px, solved)
     bent_mm = float(np.linalg.norm(board - flat, axis=1).max())
     turns = [np.asarray(cv2.Rodrigues(turn)[0]) for turn in solved.turns]
     depths = [
@@ -81,7 +81,6 @@ def place(grid: CircleGrid, views: Sequence[View], size_px: tuple[int, int]) -> 
     tilts = [_tilt_deg(turn) for turn in turns]
     distances = [float((turn @ middle)[2] + shift[2]) / 1e3 for turn, shift in zip(turns, solved.shifts, strict=True)]
     fx_px, fy_px, cx_px, cy_px = solved.matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-    error = focal_error([board[view.circles] for view in views], solved, size_px)
     if error > MOST_FOCAL_ERROR:
         raise PoseError(
             f"the focal length cannot be told from these sheets, tilted by at most {max(tilts):.0f} degrees: tilt the "
@@ -130,14 +129,17 @@ def _freed(
     centres: Sequence[Array],
     size_px: tuple[int, int],
     solved: Solved,
-) -> tuple[Array, Solved]:
-    """The sheet as it is, found along with the camera (Strobl and Hirzinger 2011), where that fits clearly better.
+) -> tuple[Array, Solved, float]:
+    """The sheet as it is, found along with the camera, and the relative standard error of its focal length.
 
     Paper bends and printers stretch, by a millimetre. The mean size is kept: which of both is wrong cannot be known.
+    Where many views show all of it each circle is where it fits best (Strobl and Hirzinger 2011), if that is clearly
+    better; few tell how it stretches and bends on the whole.
     """
     whole = [i for i, view in enumerate(views) if view.circles.size == len(flat)]
     if len(whole) < FREE_VIEWS:
-        return flat, solved
+        board, solved = solve_with_sheet(flat, [view.circles for view in views], centres, size_px, solved)
+        return board, solved, focal_error([board[view.circles] for view in views], solved, size_px, flat)
     found = cv2.calibrateCameraRO(
         [flat[views[i].circles].astype(np.float32) for i in whole],
         [np.asarray(centres[i], np.float32)[:, None] for i in whole],
@@ -152,7 +154,8 @@ def _freed(
     board[views[whole[0]].circles] = np.asarray(found[5], np.float64).reshape(-1, 3)
     board = _laid_over(board, flat)
     freed = _solved(board, views, centres, size_px, solved)
-    return (board, freed) if freed.rms < CLEARLY * solved.rms else (flat, solved)
+    board, solved = (board, freed) if freed.rms < CLEARLY * solved.rms else (flat, solved)
+    return board, solved, focal_error([board[view.circles] for view in views], solved, size_px)
 
 
 def _laid_over(board: Array, flat: Array) -> Array:

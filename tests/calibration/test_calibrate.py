@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from model_export.photographed_sheets import picture
 from service.calibration.calibrate import Picture, Task, calibrate
-from service.calibration.measure import Measured, ill_exposed
+from service.calibration.measure import Measured, ill_exposed, measure, too_blurred
 from service.calibration.plot import as_svg
 from service.calibration.report import PictureReport, Report
 from service.errors import InvalidImage
@@ -153,6 +153,17 @@ def test_what_most_photographs_are_exposed_like_is_said_once_more_of_all() -> No
     assert ill_exposed([dark, good, dark])[0].startswith("2 of 3 photographs are underexposed")
     assert ill_exposed([good, bright, bright])[0].startswith("2 of 3 photographs are overexposed")
     assert ill_exposed([dark, bright, good]) == ill_exposed([]) == ()
+
+
+def test_what_is_too_far_out_of_focus_is_said_of_each_and_of_most(taken: list[SheetPhoto]) -> None:
+    far, good = (Measured(PictureReport("", "defocused", found=False)) for _ in range(2))
+    _, _, pixels = taken[4]  # its circles are 22 px across
+    measure(far, np.asarray(cv2.GaussianBlur(pixels, (0, 0), 6.0), np.uint8), GRID, lambda _: None, every=4)
+    measure(good, np.asarray(cv2.GaussianBlur(pixels, (0, 0), 3.0), np.uint8), GRID, lambda _: None, every=4)
+    assert far.report.warnings[0].startswith("its circles are blurred by 0.5")
+    assert not good.report.warnings
+    assert too_blurred([far, good, far])[0].startswith("2 of 3 photographs are too far out of focus")
+    assert too_blurred([far, good]) == too_blurred([]) == ()
 
 
 def test_what_is_no_photograph_is_said_and_the_others_count(taken: list[SheetPhoto]) -> None:
