@@ -96,10 +96,7 @@ def _plain_failures() -> Iterator[None]:
 @commands.command()
 def train(
     run: Annotated[
-        Path,
-        typer.Option(
-            help="folder of the run: its checkpoint lies there and is gone on from", file_okay=False, writable=True
-        ),
+        Path, typer.Option(help="folder of the run: goes on from its checkpoint", file_okay=False, writable=True)
     ],
     textures: Textures,
     frames: Frames = None,
@@ -127,14 +124,13 @@ def train(
     A run that is gone on with has what it was begun with, but for what is given anew, which is said.
     """
     with _training_parts():
-        from model_export.train import config_of
-        from model_export.train import train as run_training
+        from model_export import train as training
 
     told = {"kind": kind, "steps": steps, "seed": seed, "learning_rate": learning_rate}
     given = [f"{name}={json.dumps(value)}" for name, value in told.items() if value is not None]
     with _plain_failures():
-        path = run_training(
-            config_of(run, [*given, *(setting or ())]),
+        path = training.train(
+            training.config_of(run, [*given, *(setting or ())]),
             textures,
             run,
             frames=frames,
