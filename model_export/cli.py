@@ -213,13 +213,12 @@ def export(
         from model_export.quantized import quantised_graphs
 
     pictures = [folder for folder in (textures, frames) if folder is not None]
-    with _plain_failures():
-        out.mkdir(parents=True, exist_ok=True)
     # what breaks off leaves no folder that serves, without its corrections
     with TemporaryDirectory() as scratch, progress_bar(Console(stderr=True)) as progress, _plain_failures():
         built = Path(scratch)
         task = progress.add_task("float32", total=4)
         manifest = export_checkpoint(checkpoint, pictures, built, name)
+        out.mkdir(parents=True, exist_ok=True)  # or not, which is said before minutes of work
         progress.update(task, advance=1, description=INT8)
         in_int8 = partial(quantised_graphs, floating=built)
         export_checkpoint(checkpoint, pictures, built / INT8, f"{manifest.name}-{INT8}", in_int8)
