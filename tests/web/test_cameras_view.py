@@ -355,6 +355,7 @@ def test_an_import_says_first_that_the_service_does_not_answer(
     page.get_by_label("Cameras to import").set_input_files(file)
     expect(plan.get_by_role("alert")).to_have_text(re.compile(r"^\s*The service does not answer\. Check that it runs"))
     plan.get_by_role("button", name="Cancel").click()
+    expect(page.locator("#import-title")).to_have_count(0)  # what is closed tells the page so a moment later
     page.get_by_label("Cameras to import").set_input_files(file)
     page.route("**/cameras", lambda route: route.abort(), times=1)
     plan.get_by_role("button", name="Import 1 camera").click()
