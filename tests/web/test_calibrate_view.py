@@ -356,7 +356,7 @@ def test_a_set_becomes_a_camera(
     assert (camera["source"], camera["k_cam_px"]) == ("calibration", pytest.approx(found["value"]))
     page.get_by_role("button", name="See the camera").click()
     expect(page.get_by_role("heading", name=name)).to_be_visible()
-    page.get_by_role("button", name="Measure depth").click()
+    page.get_by_role("button", name="Measure depth", exact=True).click()
     expect(page.get_by_role("tab", name="Depth")).to_be_focused()
 
 
