@@ -96,12 +96,8 @@ class Reading:
         )
 
     def leave_out(self, hidden: NDArray[np.bool_]) -> None:
-        """Answer nothing where pixels [height, width] of what was read are hidden; errors are written over."""
-        rows, columns = (
-            np.minimum((np.arange(cells) + 0.5) / ratio, size - 1).astype(np.intp)
-            for cells, ratio, size in zip(self.error.shape, self.ratio, hidden.shape, strict=True)
-        )
-        self.error[hidden[rows][:, columns]] = NO_ANSWER
+        """Answer nothing in cells whose middles are hidden pixels [height, width] of what was read, in place."""
+        self.error[Lines.spread(hidden.shape, self.error.shape).of(hidden)] = NO_ANSWER
 
     def at_focus(self, focus_distance_m: float, farthest_m: float) -> "Reading":
         """What it is where the camera is focused there and blurs alike: depths and errors, none beyond ``farthest_m``.
