@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from model_export.render import DISC, GAUSSIAN, PointSpread, Spreads, blur_varying
-from service.calibration.calibrate import Picture
+from service.calibration.calibrate import Picture, Shot
 from service.calibration.report import Role
 from service.calibration.target import CircleGrid
 from service.optics import thin_lens
@@ -141,7 +141,7 @@ def photograph(
 
 def picture(name: str, role: Role, rgb: NDArray[np.uint8]) -> Picture:
     """A photograph as a calibration takes it."""
-    return Picture(name, role, lambda: rgb)
+    return Picture(name, role, lambda: Shot(rgb))
 
 
 def sweep(rng: np.random.Generator, camera: GridCamera, grid: CircleGrid, count: int) -> list[Picture]:

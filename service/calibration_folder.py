@@ -2,14 +2,12 @@
 
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import TypeAdapter
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from service.calibration.calibrate import Picture, Task, calibrate
+from service.calibration.calibrate import Picture, Shot, Task, calibrate
 from service.calibration.fit import Interval
 from service.calibration.report import PictureReport, Report, Role
 from service.errors import InvalidImage
@@ -35,16 +33,17 @@ def pictures_in(folder: Path, limits: ImageLimits) -> list[Picture]:
 
 def _picture(path: Path, role: Role, limits: ImageLimits) -> Picture:
     name = f"{path.parent.name}/{path.name}" if path.parent.name == role else path.name
-    return Picture(shown(name), role, lambda: _frame(path, limits))
+    return Picture(shown(name), role, lambda: _shot(path, limits))
 
 
-def _frame(path: Path, limits: ImageLimits) -> NDArray[np.uint8]:
+def _shot(path: Path, limits: ImageLimits) -> Shot:
     """The photograph as the sensor had it. Raises ``InvalidImage`` for a file that cannot be read, too."""
     try:
         data = path.read_bytes()
     except OSError as exc:
         raise InvalidImage(f"The file cannot be read: {exc.strerror}.") from exc
-    return read_stored_frame(data, limits)
+    frame = read_stored_frame(data, limits)
+    return Shot(frame.rgb, frame.exif.f_number)
 
 
 def calibrate_folder(folder: Path, task: Task, limits: ImageLimits) -> Report:
@@ -95,5 +94,6 @@ def summary(report: Report) -> list[str]:
         line("gamma_px", "px", result.gamma_px),
         line("focus_distance_m", "m", result.focus_distance_m),
         f"{'fx_px':17s} {result.intrinsics.fx_px:8.1f} px  reprojection {result.reprojection_rms_px:.2f} px rms",
+        *([] if result.f_number is None else [f"{'f_number':17s} {result.f_number:8.4g}"]),
         *(f"warning: {words}" for words in result.warnings),
     ]

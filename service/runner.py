@@ -12,13 +12,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-import numpy as np
 import structlog
-from numpy.typing import NDArray
 from pydantic import ConfigDict, JsonValue, TypeAdapter
 from pydantic.dataclasses import dataclass
 
-from service.calibration.calibrate import Picture, Task
+from service.calibration.calibrate import Picture, Shot, Task
 from service.calibration.report import Method, PictureReport, Report, Result, Role
 from service.calibration.target import CircleGrid
 from service.errors import CamindError
@@ -178,8 +176,12 @@ class Runner:
         report = self._calibrate(task, pictures, tell=progress.tell, check=progress.check)
         return _ending(report, is_registered=settings.register)
 
-    def _loader(self, path: Path) -> Callable[[], NDArray[np.uint8]]:
-        return lambda: read_stored_frame(path.read_bytes(), self._limits)
+    def _loader(self, path: Path) -> Callable[[], Shot]:
+        def load() -> Shot:
+            frame = read_stored_frame(path.read_bytes(), self._limits)
+            return Shot(frame.rgb, frame.exif.f_number)
+
+        return load
 
     def _insist(self, write: Callable[[], object]) -> None:
         """Write until the database takes it or the service stops."""

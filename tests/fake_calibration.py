@@ -110,7 +110,7 @@ class FakeCalibration:
 
 def _looked_at(picture: Picture) -> PictureReport:
     try:
-        height, width, _ = picture.load().shape
+        height, width, _ = picture.load().rgb.shape
     except CamindError as exc:
         return PictureReport(picture.name, picture.role, found=False, warnings=(exc.detail,))
     return PictureReport(picture.name, picture.role, found=True, circles=44, warnings=(f"{width}x{height}",))

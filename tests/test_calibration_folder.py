@@ -19,4 +19,4 @@ def test_a_file_that_cannot_be_read_is_told_of_as_one_photograph_s_fault(tmp_pat
     for picture in (folder, gone):
         with pytest.raises(InvalidImage, match="cannot be read"):
             picture.load()
-    assert there.load().shape == (30, 40, 3)
+    assert (there.load().rgb.shape, there.load().f_number) == ((30, 40, 3), None)

@@ -114,7 +114,7 @@ def test_pictures_are_as_the_sensor_had_them(bench: Bench) -> None:
     bench.queue(jpeg(corners(), orientation=6))
     bench.run(fake)
     assert fake.has_begun.wait(PATIENCE_S)
-    pixels = fake.pictures[0][0].load()
+    pixels = fake.pictures[0][0].load().rgb
     assert pixels.shape == (48, 64, 3)
     assert np.abs(pixels[4, 4].astype(int) - (255, 0, 0)).max() <= 6
 

@@ -166,6 +166,10 @@ class ResultRead(BaseModel):
     corner_ratio: Annotated[
         float | None, Field(description="k_cam in the corners over that in the middle; null where too few circles were")
     ]
+    f_number: Annotated[
+        float | None,
+        Field(description="Aperture of the photographs by their EXIF; null where it tells none or several"),
+    ] = None
     warnings: list[str]
 
 

@@ -18,10 +18,8 @@ from service.calibration.target import CircleGrid
 from service.errors import BadRequest, Busy, InvalidImage, NotFound, TooLarge, UnsupportedKind
 from service.inference.cancellation import Cancellation
 from service.inference.drafting import draft_camera
-from service.inference.exif import read_exif
 from service.inference.frame import stored_camera_of
-from service.inference.headers import Header, read_header
-from service.inference.images import ImageLimits, read_stored_frame
+from service.inference.images import ImageLimits, StoredFrame, read_stored_frame
 from service.optics.camera import Camera, Intrinsics, Lens
 
 router = APIRouter(prefix="/calibrate", tags=["calibration"])
@@ -65,23 +63,20 @@ async def look_at_photograph(
 
 def fulfil(cancellation: Cancellation, order: Order) -> LookRead:
     """Decode and look: all the work of a request, in one thread."""
-    rgb = read_stored_frame(order.data, order.limits)
+    frame = read_stored_frame(order.data, order.limits)
     cancellation.check()
-    height_px, width_px = rgb.shape[:2]
-    header = read_header(order.data)
-    intrinsics, source = _intrinsics(order, width_px, height_px, header)
-    seen = look(rgb, order.grid, intrinsics, cancellation.check)
-    return LookRead.from_look(seen, header.orientation, source if seen.distance_m else None)
+    intrinsics, source = _intrinsics(order.camera, frame)
+    seen = look(frame.rgb, order.grid, intrinsics, cancellation.check)
+    return LookRead.from_look(seen, frame.orientation, source if seen.distance_m else None)
 
 
-def _intrinsics(
-    order: Order, width_px: int, height_px: int, header: Header
-) -> tuple[Intrinsics | None, FocalLengthFrom | None]:
+def _intrinsics(of: Camera | None, frame: StoredFrame) -> tuple[Intrinsics | None, FocalLengthFrom | None]:
     """Those of the camera at the stored frame's size, else what the EXIF tells of the lens."""
-    camera = order.camera and stored_camera_of(order.camera, width_px, height_px, header.orientation)
+    height_px, width_px = frame.rgb.shape[:2]
+    camera = of and stored_camera_of(of, width_px, height_px, frame.orientation)
     if camera and camera.intrinsics:
         return camera.intrinsics, "camera"
-    guess = draft_camera(read_exif(header.exif), width_px, height_px).lens
+    guess = draft_camera(frame.exif, width_px, height_px).lens
     if guess.focal_length_mm is None or guess.pixel_pitch_um is None:
         return None, None
     lens = Lens(guess.focal_length_mm, 1.0, guess.pixel_pitch_um, guess.sensor_width_px or width_px)

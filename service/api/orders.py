@@ -77,9 +77,8 @@ def fulfil(cancellation: Cancellation, order: Order, estimator: Estimator) -> An
     for u, v in order.query.points:
         pixel_at(u, v, part)
     known = order.query.known_depths
-    focus_is_told = order.query.focus_distance_m is not None or known
-    focus_distance_m = None if focus_is_told else camera.focus_distance_m
-    taken = taken_otherwise(photograph.exif, order.record.draft.lens, focus_distance_m)
+    is_refocused = order.query.focus_distance_m is not None or bool(known)
+    taken = taken_otherwise(photograph.exif, camera, is_refocused=is_refocused)
     registered = order.record.camera
     specs = (*maybe_of_another_size(registered), *maybe_wrong_specs(order.record.draft.lens, registered))
     shown = maybe_another_part(photograph.exif, camera)

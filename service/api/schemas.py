@@ -8,10 +8,9 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue
 from service.api.cursors import NextCursor
 from service.api.texts import Worded
 from service.errors import BadRequest
-from service.optics.camera import FOCUS_DISTANCES_M, Camera, Intrinsics, Lens
+from service.optics.camera import F_NUMBERS, FOCUS_DISTANCES_M, Camera, Intrinsics, Lens
 from service.storage.cameras import DEFAULT_K_R, NAME_PATTERN, CameraDraft, CameraRecord, Source
 
-LEAST_F_NUMBER = 0.5  # in air, where its light comes from a half space; the fastest lens that was made is f/0.7
 DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 PLAIN_TEXT = r"^[^\x00-\x08\x0b\x0c\x0e-\x1f\x7f]*$"
 NO_CONTROLS = "a description has no control characters except tabs and line breaks, and no unpaired surrogates"
@@ -25,6 +24,7 @@ Name = Annotated[
 ]
 Pixels = Annotated[int, Field(gt=0, le=100_000)]
 FocusDistance = Annotated[float, Field(ge=FOCUS_DISTANCES_M[0], le=FOCUS_DISTANCES_M[1], allow_inf_nan=False)]
+FNumber = Annotated[float, Field(ge=F_NUMBERS[0], le=F_NUMBERS[1], allow_inf_nan=False)]
 BlurPixels = Annotated[float, Field(ge=1e-6, le=1_000_000, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
 
@@ -42,15 +42,7 @@ class LensSpecs(Given):
         float,
         Field(ge=0.1, le=10_000, allow_inf_nan=False, description="Real focal length, never the 35-mm equivalent"),
     ]
-    f_number: Annotated[
-        float,
-        Field(
-            ge=LEAST_F_NUMBER,
-            le=1_000,
-            allow_inf_nan=False,
-            description="Aperture number N; in air no lens has less than 0.5",
-        ),
-    ]
+    f_number: Annotated[FNumber, Field(description="Aperture number N; in air no lens has less than 0.5")]
     pixel_pitch_um: Annotated[
         float, Field(ge=0.01, le=1_000, allow_inf_nan=False, description="Pitch of one sensor pixel")
     ]
@@ -125,6 +117,9 @@ class CameraSpecs(Given):
     k_cam_px: Annotated[
         BlurPixels | None, Field(description="Blur per unit of relative defocus, at `image_width_px`")
     ] = None
+    f_number: Annotated[
+        FNumber | None, Field(description="Aperture that `k_cam_px` holds at, to know photographs of another by")
+    ] = None
     lens: LensSpecs | None = None
     gamma_px: Annotated[
         float, Field(ge=0, le=1_000, allow_inf_nan=False, description="Blur of a point in perfect focus")
@@ -147,6 +142,7 @@ class CameraSpecs(Given):
                 k_cam_px=self._k_cam_px(lens),
                 gamma_px=self.gamma_px,
                 focal_length_m=lens.focal_length_m if lens else None,
+                f_number=lens.f_number if lens else self.f_number,
                 intrinsics=intrinsics,
             )
         except (ValueError, ArithmeticError) as exc:
@@ -158,6 +154,8 @@ class CameraSpecs(Given):
         if lens is None or self.k_cam_px is not None:
             both = "not both" if lens else "one of them is needed"
             raise BadRequest.at(f"Send exactly one of k_cam_px and lens, {both}.", "#/k_cam_px", "#/lens")
+        if self.f_number is not None:
+            raise BadRequest.at("With lens, f_number is that of the lens: send it there alone.", "#/f_number")
         if lens.focal_length_m >= self.focus_distance_m:
             raise BadRequest.at(
                 f"A lens of {lens.focal_length_mm:g} mm cannot focus at {self.focus_distance_m:g} m: "
@@ -172,7 +170,7 @@ AND_MORE: dict[str, JsonValue] = {"additionalProperties": True}
 # what to_draft asks for, in words that what makes clients passes over: of a choice it makes types, or fails
 K_CAM_OR_LENS: dict[str, JsonValue] = {
     "if": {"required": ["lens"], "properties": {"lens": {"type": "object"}}, **AND_MORE},
-    "then": {"properties": {"k_cam_px": {"type": "null"}}, **AND_MORE},
+    "then": {"properties": {"k_cam_px": {"type": "null"}, "f_number": {"type": "null"}}, **AND_MORE},
     "else": {"required": ["k_cam_px"], "properties": {"k_cam_px": {"type": "number"}}, **AND_MORE},
 }
 K_CAM_EXAMPLE: dict[str, JsonValue] = {
@@ -217,6 +215,7 @@ class CameraCreate(CameraSpecs):
             image_height_px=camera.image_height_px,
             focus_distance_m=camera.focus_distance_m,
             k_cam_px=None if lens else camera.k_cam_px,
+            f_number=None if lens else camera.f_number,
             lens=_lens_read(lens),
             gamma_px=camera.gamma_px,
             intrinsics=PinholeIntrinsics.model_validate(inner) if inner else None,
@@ -286,6 +285,7 @@ class CameraRead(BaseModel):
         Field(description="Diameter of the circle of confusion over its standard deviation, behind k_cam"),
     ]
     source: Annotated[Source, Field(description="Where k_cam came from")]
+    f_number: Annotated[float | None, Field(description="Aperture that k_cam holds at; null where it is not known")]
     lens: LensSpecs | None
     intrinsics: IntrinsicsRead | None
     fx_px: Annotated[float | None, Field(description="From the intrinsics or the lens, else null")]
@@ -309,6 +309,7 @@ class CameraRead(BaseModel):
             gamma_px=camera.gamma_px,
             k_r=draft.k_r,
             source=draft.source,
+            f_number=camera.f_number,
             lens=_lens_read(draft.lens),
             intrinsics=IntrinsicsRead.from_domain(camera.intrinsics) if camera.intrinsics else None,
             fx_px=_fx_px(draft),

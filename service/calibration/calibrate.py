@@ -11,7 +11,15 @@ from threadpoolctl import threadpool_limits
 
 from service.calibration import fit
 from service.calibration.edge import PointSpread, find_spread, fit_again
-from service.calibration.measure import LEAST_CIRCLES, Measured, ill_exposed, measure, otherwise_sized, too_blurred
+from service.calibration.measure import (
+    LEAST_CIRCLES,
+    Measured,
+    aperture_of,
+    ill_exposed,
+    measure,
+    otherwise_sized,
+    too_blurred,
+)
 from service.calibration.pose import Placement, PoseError, place
 from service.calibration.refocus import refocused
 from service.calibration.report import Method, PictureReport, Report, Result, Role, Sample
@@ -33,15 +41,23 @@ LEAST_FIELD_CIRCLES = 12
 
 
 @dataclass(frozen=True, slots=True)
+class Shot:
+    """A decoded photograph: RGB uint8 [h,w,3] as the sensor had it, and the aperture it says it was taken with."""
+
+    rgb: NDArray[np.uint8]
+    f_number: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Picture:
-    """One photograph, decoded when it is its turn: ``load`` gives RGB uint8 [h,w,3] as the sensor had it.
+    """One photograph, decoded by ``load`` when it is its turn.
 
     ``load`` may raise ``CamindError`` (the picture is then reported as not readable, with its words).
     """
 
     name: str
     role: Role
-    load: Callable[[], NDArray[np.uint8]]
+    load: Callable[[], Shot]
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,11 +118,12 @@ def _partner(picture: Picture, measured: list[Measured]) -> Measured | None:
 def _measured(task: Task, picture: Picture, at: Callable[[float], None], partner: Measured | None) -> Measured:
     out = Measured(PictureReport(picture.name, picture.role, found=False))
     try:
-        rgb = picture.load()
+        shot = picture.load()
     except CamindError as error:
         out.warn(error.detail)
         return out
-    measure(out, rgb, task.grid, at, method=task.method, partner=partner)
+    out.f_number = shot.f_number
+    measure(out, shot.rgb, task.grid, at, method=task.method, partner=partner)
     return out
 
 
@@ -134,6 +151,7 @@ def _result(task: Task, measured: list[Measured], at: Callable[[float], None]) -
         one.report = replace(one.report, distance_m=distance, tilt_deg=tilt, blur_px=blur_px)
     samples = tuple(_samples(usable, circles, constants))
     corners = _corner_ratio(samples, placement, size_px)
+    f_number, apertures = aperture_of(usable)
     return Result(
         *size_px,
         k_cam_px=constants.k_cam_px,
@@ -145,6 +163,7 @@ def _result(task: Task, measured: list[Measured], at: Callable[[float], None]) -
         samples=samples,
         curve=constants.curve,
         corner_ratio=corners,
+        f_number=f_number,
         warnings=(
             *_left_out(measured, usable),
             *ill_exposed(measured),
@@ -154,6 +173,7 @@ def _result(task: Task, measured: list[Measured], at: Callable[[float], None]) -
             *constants.warnings,
             *(refocused(circles, constants) if task.method == "edge" else ()),
             *_uneven(corners),
+            *apertures,
         ),
     )
 

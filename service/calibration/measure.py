@@ -1,5 +1,6 @@
 """One photograph of the sheet measured: its grid found, and the blur of each circle read."""
 
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,6 +14,7 @@ from service.calibration.pose import View
 from service.calibration.report import Method, PictureReport
 from service.calibration.target import CircleGrid
 from service.opencv import cv2
+from service.optics.camera import F_NUMBERS
 from service.optics.light import decode_srgb
 
 LEAST_CIRCLES = 8
@@ -21,6 +23,7 @@ DARK_LEVEL = 80  # of the paper: below, noise is a large part of the circles' co
 PLATEAU, PLATEAU_CIRCLES, LEAST_PLATEAU = 0.7, 0.5, 160  # of the paper at one level, of the circles so, from where on
 CLIPPED_CIRCLES = 0.1  # of a picture's, from where on it is overexposed
 FAR_RADII = 0.45  # of blur: circles of half a radius read up to 4 % wrong, of two thirds a third, one side or the other
+SAME_APERTURE = 1.05  # a third of a stop is 1.12
 OTHER_SIZE = 1.1  # paper shrinks and ink spreads less
 PAPER_FROM_RADII, PAPER_TO_RADII = 1.3, 1.6
 LUMINANCE = (0.2126, 0.7152, 0.0722)
@@ -39,6 +42,7 @@ class Measured:
     slices_px: list[float] = field(default_factory=list)  # lambda as the paper reads it, if asked for
     paper_levels: list[float] = field(default_factory=list)  # of the white around each circle looked at, 0 to 255
     plateaus: list[int] = field(default_factory=list)  # the level of those around which nearly all white has one
+    f_number: float | None = None
 
     @property
     def is_dark(self) -> bool:
@@ -81,6 +85,18 @@ def otherwise_sized(measured: Sequence[Measured]) -> tuple[str, ...]:
         f"the circles are {ratio:.3g} times as large, beside what is between them, as was told: one of spacing_mm and "
         f"diameter_mm is not the sheet's, and metres follow spacing_mm{linear}",
     )
+
+
+def aperture_of(measured: Sequence[Measured]) -> tuple[float | None, tuple[str, ...]]:
+    """The one that the defocused photographs were taken with, for k_cam is theirs; a warning where it is not one."""
+    told = [one.f_number or math.nan for one in measured if one.report.role == "defocused"]
+    told = [f_number for f_number in told if F_NUMBERS[0] <= f_number <= F_NUMBERS[1]]
+    if not told:
+        return None, ()
+    least, most = min(told), max(told)
+    if most > least * SAME_APERTURE:
+        return None, (f"their EXIF says f/{least:.3g} to f/{most:.3g}, and k_cam_px can be that of one aperture alone",)
+    return float(np.median(told)), ()
 
 
 def ill_exposed(measured: Sequence[Measured]) -> tuple[str, ...]:

@@ -54,7 +54,8 @@ class Result:
     """The camera's constants with 95 % intervals, in pixels of pictures of this size, and what they rest on.
 
     ``focus_distance_m`` is an interval of no width where the user gave it; ``point_spread`` is the shape of defocus
-    that fits the circles better; ``corner_ratio`` is k_cam in the corners over that in the middle, if both were seen.
+    that fits the circles better; ``corner_ratio`` is k_cam in the corners over that in the middle, if both were seen,
+    ``f_number`` the aperture that the photographs' EXIF tells, if it is one.
     """
 
     image_width_px: int
@@ -68,6 +69,7 @@ class Result:
     samples: tuple[Sample, ...]
     curve: tuple[CurvePoint, ...]
     corner_ratio: float | None = None
+    f_number: float | None = None
     warnings: tuple[str, ...] = ()
 
     def to_camera(self) -> Camera:
@@ -78,6 +80,7 @@ class Result:
             focus_distance_m=self.focus_distance_m.value,
             k_cam_px=self.k_cam_px.value,
             gamma_px=self.gamma_px.value,
+            f_number=self.f_number,
             intrinsics=self.intrinsics,
         )
 

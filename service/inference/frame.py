@@ -70,39 +70,32 @@ def _all_but_infinite(focus_distance_m: float) -> Iterator[str]:
         )
 
 
-def taken_otherwise(exif: Exif, lens: Lens | None, focus_distance_m: float | None) -> Iterator[str]:
-    """Warnings where a photograph was zoomed, rendered, or not taken with the lens or the focus that were told.
+def taken_otherwise(exif: Exif, camera: Camera, *, is_refocused: bool) -> Iterator[str]:
+    """Warnings where a photograph was zoomed, rendered, or not taken as the camera was, as far as that is known.
 
-    Also where what was told of the lens makes no sensor.
-
-    ``focus_distance_m`` is the camera's where the photograph came without one of its own.
+    ``is_refocused``: the photograph came with a focus distance of its own, or with known depths, which tell it.
     """
     if exif.is_zoomed:
         said = f"its EXIF says a digital zoom of {exif.zoom:.4g}"
         yield f"{said}: the metres hold for a camera registered at that zoom alone"
     if exif.rendering is not None:
         yield f"its EXIF says {exif.rendering}: its blur may be computed, and no lens'"
-    if lens is not None:
-        yield from _other_lens(exif, lens)
-        yield from _impossible_sensor(lens)
-    if focus_distance_m is not None:
-        yield from _other_focus(exif, focus_distance_m)
+    yield from _other_lens(exif, camera)
+    if not is_refocused:
+        yield from _other_focus(exif, camera.focus_distance_m)
 
 
-def _other_lens(exif: Exif, lens: Lens) -> Iterator[str]:
-    told = ((exif.focal_length_mm, lens.focal_length_mm, "{:g} mm"), (exif.f_number, lens.f_number, "f/{:g}"))
-    known = [(theirs, ours, form) for theirs, ours, form in told if theirs is not None]
-    if any(abs(theirs / ours - 1) > LENS_TOLERANCE for theirs, ours, _ in known):
-        says = " ".join(form.format(round(theirs, 2)) for theirs, _, form in known)
-        yield f"its EXIF says {says}, the camera is {lens.focal_length_mm:g} mm f/{lens.f_number:g}"
+def _other_lens(exif: Exif, camera: Camera) -> Iterator[str]:
+    told = (exif.focal_length_mm, exif.f_number)
+    known = (camera.focal_length_m and camera.focal_length_m * 1e3, camera.f_number)
+    both = ((theirs, ours) for theirs, ours in zip(told, known, strict=True) if theirs and ours)
+    if any(abs(theirs / ours - 1) > LENS_TOLERANCE for theirs, ours in both):
+        yield f"its EXIF says {_as_engraved(*told)}, the camera is {_as_engraved(*known)}"
 
 
-def _impossible_sensor(lens: Lens) -> Iterator[str]:
-    if not SENSOR_WIDTHS_MM[0] <= lens.sensor_width_mm <= SENSOR_WIDTHS_MM[1]:
-        yield (
-            f"lens.pixel_pitch_um times lens.sensor_width_px is a sensor {lens.sensor_width_mm:.3g} mm wide, which "
-            "hardly can be: k_cam and metres are wrong if it is not"
-        )
+def _as_engraved(focal_length_mm: float | None, f_number: float | None) -> str:
+    engraved = ((focal_length_mm, "{:g} mm"), (f_number, "f/{:g}"))
+    return " ".join(form.format(round(value, 2)) for value, form in engraved if value)
 
 
 def maybe_of_another_size(camera: Camera) -> Iterator[str]:
@@ -120,12 +113,17 @@ def maybe_of_another_size(camera: Camera) -> Iterator[str]:
 
 
 def maybe_wrong_specs(lens: Lens | None, camera: Camera) -> Iterator[str]:
-    """Warnings where specs are those of a tall picture's height, or of another field of view than the intrinsics are.
+    """Warnings where specs make no sensor, are a tall picture's height, or have another field of view than intrinsics.
 
     k_cam hangs on the same specs. That the lens is longer focused close is allowed for.
     """
     if lens is None:
         return
+    if not SENSOR_WIDTHS_MM[0] <= lens.sensor_width_mm <= SENSOR_WIDTHS_MM[1]:
+        yield (
+            f"lens.pixel_pitch_um times lens.sensor_width_px is a sensor {lens.sensor_width_mm:.3g} mm wide, which "
+            "hardly can be: k_cam and metres are wrong if it is not"
+        )
     if lens.sensor_width_px == camera.image_height_px > camera.image_width_px:
         yield (
             f"lens.sensor_width_px, {lens.sensor_width_px}, is the images' height: of tall ones it is the sensor's "

@@ -114,6 +114,15 @@ class Photograph:
         return int(self.rgb.shape[0])
 
 
+@dataclass(frozen=True, slots=True)
+class StoredFrame:
+    """``rgb``: uint8 [height, width, 3], sRGB, as the file has it, whatever its EXIF's ``orientation``, 1..8."""
+
+    rgb: NDArray[np.uint8]
+    orientation: int
+    exif: Exif
+
+
 def photographs_in(folder: Path) -> list[Path]:
     """The files of a folder that end as photographs do, by name."""
     return sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)
@@ -143,15 +152,15 @@ def read_photograph(data: bytes, media_type: str | None = None, limits: ImageLim
     return Photograph(turned(stored, orientation), kind, orientation, warnings, read_exif(header.exif))
 
 
-def read_stored_frame(data: bytes, limits: ImageLimits | None = None) -> NDArray[np.uint8]:
-    """The pixels [h, w, 3] RGB as the sensor had them, orientation not applied: a lens belongs to its sensor.
+def read_stored_frame(data: bytes, limits: ImageLimits | None = None) -> StoredFrame:
+    """The photograph as the sensor had it, orientation not applied: a lens belongs to its sensor.
 
     Raises as ``read_photograph`` does, and ``UnsupportedKind`` for light that would be measured by a wrong curve.
     """
     header, stored, _ = _read(data, limits or ImageLimits())
     if header.other_curve is not None:
         raise UnsupportedKind(f"Its colour profile is {header.other_curve}: export it as sRGB, to be measured.")
-    return stored
+    return StoredFrame(stored, header.orientation, read_exif(header.exif))
 
 
 def turned(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:

@@ -9,6 +9,7 @@ from service.optics import thin_lens
 RANGE_BLUR_ERROR_PX = 0.25
 RANGE_DEPTH_ERROR = 0.1
 ASPECT_TOLERANCE = 0.01
+F_NUMBERS = (0.5, 1_000.0)  # in air, light from a half space is the least; the fastest lens that was made is f/0.7
 FOCUS_DISTANCES_M = (0.001, 100_000.0)  # that can be told; the farthest stands for infinity
 
 
@@ -106,7 +107,8 @@ class Camera:
     """What turns blur into metres, at one image size and one focus distance.
 
     ``k_cam_px`` and ``gamma_px`` hold at ``image_width_px``. ``focal_length_m`` (real, not equivalent) is
-    needed only to move the focus exactly. Raises ``ValueError`` naming the field that is out of bounds.
+    needed only to move the focus exactly, ``f_number``, at which ``k_cam_px`` holds, only to know other photographs.
+    Raises ``ValueError`` naming the field that is out of bounds.
     """
 
     image_width_px: int
@@ -116,6 +118,7 @@ class Camera:
     gamma_px: float = 0.5
     focal_length_m: float | None = None
     intrinsics: Intrinsics | None = None
+    f_number: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("image_width_px", "image_height_px", "focus_distance_m", "k_cam_px"):

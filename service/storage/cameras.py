@@ -286,7 +286,7 @@ def _to_revision_row(camera_id: int, number: int, draft: CameraDraft, now: datet
         gamma_px=camera.gamma_px,
         k_r=draft.k_r,
         focal_length_mm=lens.focal_length_mm if lens else None,
-        f_number=lens.f_number if lens else None,
+        f_number=lens.f_number if lens else camera.f_number,
         pixel_pitch_um=lens.pixel_pitch_um if lens else None,
         sensor_width_px=lens.sensor_width_px if lens else None,
         fx_px=intrinsics.fx_px if intrinsics else None,
@@ -306,6 +306,7 @@ def _to_record(row: CameraRow, revision: CameraRevisionRow) -> CameraRecord:
         k_cam_px=revision.k_cam_px,
         gamma_px=revision.gamma_px,
         focal_length_m=lens.focal_length_m if lens else None,
+        f_number=revision.f_number,
         intrinsics=_to_intrinsics(revision),
     )
     draft = CameraDraft(row.name, camera, _to_source(revision.source), lens, revision.description)

@@ -76,6 +76,7 @@ def _draft(body: Body, lens_name: str, focal_length_mm: float, f_number: float) 
         focus_distance_m=FOCUS_DISTANCE_M,
         k_cam_px=lens.k_cam_px(FOCUS_DISTANCE_M, body.width_px),
         focal_length_m=lens.focal_length_m,
+        f_number=f_number,
     )
     name = f"{body.slug}-{focal_length_mm:g}mm-f{f_number:g}"
     return CameraDraft(name, camera, "lens", lens, f"{body.label}, {lens_name}, focused at 2 m (Table 1)")

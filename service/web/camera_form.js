@@ -122,9 +122,7 @@ export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 			<div ref=${trouble} tabindex="-1" hidden=${!problem && !theirs}>
 				${theirs &&
 				html`<${Conflict}
-					base=${base}
-					theirs=${theirs}
-					fields=${fields}
+					...${{ base, theirs, fields }}
 					onMine=${() => {
 						setTheirs(null);
 						setBase(theirs);
@@ -172,6 +170,7 @@ export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 					</div>`
 				: html`<div class="pair">
 						${field("k_cam_px", "k_cam (px)", { hint: "blur per unit of relative defocus, at the image width" })}
+						${field("f_number", "f-number", { hint: "k_cam holds at" })}
 					</div>`}
 			${held &&
 			refocused &&

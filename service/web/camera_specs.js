@@ -1,11 +1,12 @@
 /** A camera between its forms: what the API answers, what it takes, and the fields a person fills in. */
 
-import { decimal, toMetres } from "./numbers.js";
+import { decimal, short, toMetres } from "./numbers.js";
 
 /** @typedef {Record<string, string>} Fields by the pointer's path: "lens/f_number" */
 
 const SIZE = ["image_width_px", "image_height_px"];
 const LENS = ["focal_length_mm", "f_number", "pixel_pitch_um", "sensor_width_px", "k_r"];
+const K_CAM = ["k_cam_px", "f_number"];
 const PINHOLE = ["fx_px", "fy_px", "cx_px", "cy_px"];
 const NEEDED = {
 	"image_width_px": "image width",
@@ -43,10 +44,17 @@ export const BLANK = { "by": "lens", "gamma_px": "0.5", "lens/k_r": "4" };
 
 /** What `POST /cameras` takes, of a camera that the API answered. @param {any} camera */
 export function specsOf(camera) {
-	const { name, image_width_px, image_height_px, focus_distance_m, k_cam_px, gamma_px, lens } = camera;
+	const { name, image_width_px, image_height_px, focus_distance_m, k_cam_px, f_number, gamma_px, lens } = camera;
 	const { intrinsics = null, description = null } = camera;
-	const blur = lens ? { lens } : { k_cam_px };
+	const blur = lens ? { lens } : { k_cam_px, f_number };
 	return { name, description, image_width_px, image_height_px, focus_distance_m, ...blur, gamma_px, intrinsics };
+}
+
+/** Those of a camera or result, in words. @param {any} of */
+export function intrinsicsIn({ intrinsics }) {
+	const pinhole = PINHOLE.map((name) => `${name.slice(0, 2)} ${short(intrinsics[name], 5)}`);
+	const terms = intrinsics.distortion.map((/** @type {number} */ term) => short(term));
+	return `${pinhole.join(", ")} px; distortion ${terms.join(", ") || "none"}`;
 }
 
 /** @param {any} camera as the API answers or takes it; what is null stays empty @returns {Fields} */
@@ -59,7 +67,7 @@ export function fieldsOf(camera) {
 	const plain = ["name", "description", "image_width_px", "image_height_px", "focus_distance_m", "gamma_px"];
 	for (const name of plain) fill(name, camera[name]);
 	if (camera.lens) for (const name of LENS) fill(`lens/${name}`, camera.lens[name]);
-	else fill("k_cam_px", camera.k_cam_px);
+	else for (const name of K_CAM) fill(name, camera[name]);
 	if (camera.intrinsics) {
 		for (const name of PINHOLE) fill(`intrinsics/${name}`, camera.intrinsics[name]);
 		fill("intrinsics/distortion", (camera.intrinsics.distortion ?? []).join(", "));
@@ -94,8 +102,8 @@ export function bodyOf(fields) {
 	for (const path of [...Object.keys(NEEDED), "gamma_px"]) if (text(path)) body[path] = number(path);
 	if (fields.by === "lens") {
 		body.lens = Object.fromEntries(LENS.filter((name) => text(`lens/${name}`)).map((name) => [name, number(`lens/${name}`)]));
-	} else if (text("k_cam_px")) {
-		body.k_cam_px = number("k_cam_px");
+	} else {
+		for (const name of K_CAM) if (text(name)) body[name] = number(name);
 	}
 	const pinhole = PINHOLE.filter((name) => text(`intrinsics/${name}`));
 	const distortion = text("intrinsics/distortion");

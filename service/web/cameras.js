@@ -4,7 +4,7 @@ import { getJson, problemOf, request } from "./api.js";
 import { CameraCurve } from "./camera_curve.js";
 import { ImportDialog, exportCameras } from "./camera_files.js";
 import { CameraForm, arriveAt } from "./camera_form.js";
-import { differences } from "./camera_specs.js";
+import { differences, intrinsicsIn } from "./camera_specs.js";
 import { counted, short, when } from "./numbers.js";
 import { ProblemBox, useProblem } from "./problem_box.js";
 import { html, useEffect, useMemo, useRef, useState } from "./vendor/preact.js";
@@ -30,6 +30,7 @@ export function CamerasView({ shown, cameras, lacksCameras, camera, reloadCamera
 		[cameras, filter],
 	);
 	const read = open.kind === "read" ? cameras?.find(({ name }) => name === open.name) : null;
+	const edited = open.kind === "edit" ? open.camera : null;
 
 	const isTyped = useRef(false);
 
@@ -40,8 +41,7 @@ export function CamerasView({ shown, cameras, lacksCameras, camera, reloadCamera
 	}
 
 	useEffect(() => {
-		const { kind } = open;
-		const name = kind === "read" ? open.name : kind === "edit" ? open.camera.name : null;
+		const name = open.kind === "read" ? open.name : (edited?.name ?? null);
 		if (!shown || name === camera) return;
 		if (mayLeave()) show(camera);
 		else go("cameras", { camera: name, replaces: true });
@@ -140,13 +140,13 @@ export function CamerasView({ shown, cameras, lacksCameras, camera, reloadCamera
 					${open.kind === "none" &&
 					!!cameras?.length &&
 					html`<p class="hint">Choose a camera to see what it can measure.</p>`}
-					${(open.kind === "new" || open.kind === "edit") &&
+					${(open.kind === "new" || edited) &&
 					html`<${CameraForm}
-						key=${open.kind === "edit" ? open.camera.name : ""}
-						editing=${open.kind === "edit" ? open.camera : null}
+						key=${edited?.name}
+						editing=${edited}
 						onSaved=${changed}
 						onTyped=${() => setTyped(true)}
-						onCancel=${() => show(open.kind === "edit" ? open.camera.name : null)}
+						onCancel=${() => show(edited?.name ?? null)}
 					/>`}
 					${open.kind === "read" && cameras && !read && html`<p class="notice">There is no camera ${open.name}.</p>`}
 					${read &&
@@ -215,20 +215,16 @@ function CameraCard({ camera, opened, go, onEdit, onDeleted, onStale }) {
 				<dt>Image</dt><dd>${camera.image_width_px} × ${camera.image_height_px} px</dd>
 				<dt>Focus distance</dt><dd>${short(camera.focus_distance_m, 4)} m</dd>
 				<dt>gamma</dt><dd>${short(camera.gamma_px)} px</dd>
+				${!lens && camera.f_number && html`<dt>Aperture</dt><dd>f/${camera.f_number}</dd>`}
 				${lens &&
 				html`<dt>Lens</dt>
 					<dd>${lens.focal_length_mm} mm f/${lens.f_number}, ${lens.pixel_pitch_um} µm pixels, sensor ${lens.sensor_width_px} px wide, k_r ${lens.k_r}</dd>`}
 				${intrinsics &&
-				html`<dt>Intrinsics</dt>
-					<dd>
-						fx ${short(intrinsics.fx_px, 5)}, fy ${short(intrinsics.fy_px, 5)}, cx ${short(intrinsics.cx_px, 5)}, cy${" "}
-						${short(intrinsics.cy_px, 5)}${intrinsics.distortion.length > 0 &&
-						`; distortion ${intrinsics.distortion.map((/** @type {number} */ term) => short(term)).join(", ")}`}
-					</dd>`}
+				html`<dt>Intrinsics</dt><dd>${intrinsicsIn(camera)}</dd>`}
 				<dt>Changed</dt><dd>${when(camera.updated_at)}</dd>
 			</dl>
 			<${Revisions} path=${`${path}/revisions`} />
-			${isDeleting && html`<${DeleteDialog} camera=${camera} path=${path} onClose=${() => setIsDeleting(false)} ...${{ onDeleted, onStale }} />`}
+			${isDeleting && html`<${DeleteDialog} onClose=${() => setIsDeleting(false)} ...${{ camera, path, onDeleted, onStale }} />`}
 		</article>
 	`;
 }

@@ -1,6 +1,7 @@
 /** The third and fourth step: a calibration while it runs, and what it found. */
 
 import { problemOf, request, sendJson } from "./api.js";
+import { intrinsicsIn } from "./camera_specs.js";
 import { Chart } from "./chart.js";
 import { counted, measure, short } from "./numbers.js";
 import { ProblemBox, Warnings, useProblem } from "./problem_box.js";
@@ -111,10 +112,9 @@ export function Ended({ job, cameras, onAccepted, onDiscard, onAgain, go }) {
 				<h3>Lens</h3>
 				<dl class="facts">
 					<dt>Image</dt><dd>${result.image_width_px} × ${result.image_height_px} px</dd>
-					<dt>fx, fy</dt><dd>${short(result.intrinsics.fx_px, 5)}, ${short(result.intrinsics.fy_px, 5)} px</dd>
-					<dt>cx, cy</dt><dd>${short(result.intrinsics.cx_px, 5)}, ${short(result.intrinsics.cy_px, 5)} px</dd>
-					<dt>Distortion</dt><dd>${result.intrinsics.distortion.map((/** @type {number} */ term) => short(term)).join(", ") || "none"}</dd>
+					<dt>Intrinsics</dt><dd>${intrinsicsIn(result)}</dd>
 					<dt>Reprojection error</dt><dd>${short(result.reprojection_rms_px)} px rms</dd>
+					${result.f_number && html`<dt>Aperture</dt><dd>f/${result.f_number}</dd>`}
 					<dt>Point spread</dt><dd>${SPREADS[/** @type {keyof typeof SPREADS} */ (result.point_spread)]}</dd>
 					<dt>Corners</dt>
 					<dd>${result.corner_ratio === null ? "too few circles there" : `k_cam is ${short(result.corner_ratio)} times that of the middle`}</dd>
@@ -254,7 +254,7 @@ function Accept({ job, cameras, isVague, onAccepted, onDiscard, onAgain, go }) {
 			<${ProblemBox} problem=${fault ? null : problem} />
 			<${TextField}
 				...${{ id: "accept-name", label: "Store it as camera", list: "camera-names", value: name, onInput: setName, fault }}
-				hint=${there ? `It becomes revision ${there.revision + 1} of ${there.name}; revision ${there.revision} is kept.` : "A new camera."}
+				hint=${there ? `It becomes revision ${there.revision + 1} of ${there.name}; the others are kept.` : "A new camera."}
 			/>
 			<div class="row">
 				${isVague && html`<button type="button" class="primary" onClick=${onAgain}>Back to the photographs</button>`}

@@ -282,9 +282,9 @@ function draw(canvas, bitmap, look) {
 /** @param {{seen: import("./guidance.js").Seen[]}} props */
 function Coverage({ seen }) {
 	const cells = coverageOf(seen);
-	const most = Math.max(...cells.flat());
-	const covered = cells.flat().filter((count) => count > 0).length;
-	const words = `Circles were in ${covered} of ${cells.flat().length} parts of the frame`;
+	const all = cells.flat();
+	const most = Math.max(...all);
+	const words = `Circles were in ${all.filter(Boolean).length} of ${all.length} parts of the frame`;
 	return html`
 		<figure class="card">
 			<figcaption><h3>Coverage of the frame</h3></figcaption>

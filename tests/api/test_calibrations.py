@@ -17,8 +17,9 @@ from starlette.testclient import TestClient
 
 from service.app import create_app
 from service.config import Settings
+from service.inference.exif import F_NUMBER
 from tests.fake_calibration import RESULT, SETTINGS, FakeCalibration, without_calibrations
-from tests.inference.photographs import corners, jpeg, png
+from tests.inference.photographs import corners, exif_of, jpeg, png, with_exif
 from tests.simulated_sheets import CAMERA, DEPTHS_M, GRID, sheet_photos
 
 PROBLEM = "application/problem+json"
@@ -491,7 +492,9 @@ def test_photographs_of_a_sheet_become_a_camera_that_depth_can_use(settings: Set
         "pattern": {"kind": GRID.kind, "rows": 7, "columns": 3, "spacing_mm": 26.0, "diameter_mm": 18.0},
         "register": True,
     }
-    parts = [picture(name=f"{name}.jpg", content=jpeg(rgb)) for name, _, rgb in sheet_photos(CAMERA, DEPTHS_M)]
+    wide_open, stopped_down = (exif_of({}, {F_NUMBER: (number, 10)}) for number in (20, 56))
+    photos = [(name, jpeg(rgb)) for name, _, rgb in sheet_photos(CAMERA, DEPTHS_M)]
+    parts = [picture(name=f"{name}.jpg", content=with_exif(data, wide_open)) for name, data in photos]
     with TestClient(create_app(whole)) as client:
         response = send(client, settings_part(given), *parts, prefer="wait=60")
         assert response.status_code == 200, response.text
@@ -502,6 +505,11 @@ def test_photographs_of_a_sheet_become_a_camera_that_depth_can_use(settings: Set
         camera = client.get("/cameras/bench").json()
         assert camera["k_cam_px"] == pytest.approx(CAMERA.k_cam_px, rel=0.04)
         assert camera["focus_distance_m"] == pytest.approx(CAMERA.focus_distance_m, rel=0.02)
+        assert found["result"]["f_number"] == camera["f_number"] == 2.0
+        for exif, is_told in ((wide_open, False), (stopped_down, True)):
+            answer = client.post("/depth?camera=bench&format=json", content=with_exif(photos[0][1], exif))
+            said = "its EXIF says f/5.6, the camera is f/2"
+            assert (answer.status_code, said in answer.json()["warnings"]) == (200, is_told), answer.text
         plot = client.get(f"/calibrations/{found['id']}/plot.svg")
         assert (plot.status_code, plot.headers["content-type"]) == (200, "image/svg+xml")
 

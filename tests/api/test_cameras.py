@@ -97,6 +97,18 @@ def test_intrinsics_and_description_come_back_as_sent(client: TestClient, phone:
     assert camera["fx_px"] == 3000
 
 
+def test_the_aperture_is_the_lens_s_or_that_of_k_cam_and_told_once(
+    client: TestClient, phone: dict[str, Any], d200: dict[str, Any]
+) -> None:
+    assert client.post("/cameras", json=phone).json()["f_number"] is None
+    assert client.put(f"/cameras/{phone['name']}", json=phone | {"f_number": 1.85}).json()["f_number"] == 1.85
+    assert client.get(f"/cameras/{phone['name']}").json()["f_number"] == 1.85
+    answer = client.post("/cameras", json=d200 | {"f_number": 2.8})
+    assert answer.status_code == 422
+    assert [fault["pointer"] for fault in answer.json()["errors"]] == ["#/f_number"]
+    assert client.post("/cameras", json=d200).json()["f_number"] == d200["lens"]["f_number"]
+
+
 def test_a_taken_name_is_a_conflict(client: TestClient, d200: dict[str, Any]) -> None:
     client.post("/cameras", json=d200)
     answer = client.post("/cameras", json=d200)
@@ -259,11 +271,12 @@ def test_lens_specs_beside_the_camera_are_told_their_place(client: TestClient, d
     answer = client.post("/cameras", json=d200 | lens)
     assert answer.status_code == 422
     faults = {fault["pointer"]: fault["detail"] for fault in answer.json()["errors"]}
+    del lens["f_number"]  # is one beside k_cam_px
     assert {f"#/{name}" for name in lens} <= faults.keys()
     assert all(f'{{"lens": {{"{name}": ...}}}}' in faults[f"#/{name}"] for name in lens)
 
 
-NUMBERS = ["image_width_px", "image_height_px", "focus_distance_m", "k_cam_px"]
+NUMBERS = ["image_width_px", "image_height_px", "focus_distance_m", "k_cam_px", "f_number"]
 LENS_NUMBERS = ["focal_length_mm", "f_number", "pixel_pitch_um", "sensor_width_px", "k_r"]
 LENS = {"focal_length_mm": 35, "f_number": 2.8, "pixel_pitch_um": 6.05, "sensor_width_px": 3872}
 BAD = [

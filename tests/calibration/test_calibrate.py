@@ -5,13 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from model_export.photographed_sheets import picture
-from service.calibration.calibrate import Picture, Task, calibrate
-from service.calibration.measure import Measured, ill_exposed, measure, too_blurred
+from service.calibration.calibrate import Picture, Shot, Task, calibrate
+from service.calibration.measure import Measured, aperture_of, ill_exposed, measure, too_blurred
 from service.calibration.plot import as_svg
-from service.calibration.report import PictureReport, Report
+from service.calibration.report import PictureReport, Report, Role
 from service.errors import InvalidImage
 from service.inference.cancellation import Cancelled
 from service.opencv import cv2
@@ -155,6 +154,17 @@ def test_what_most_photographs_are_exposed_like_is_said_once_more_of_all() -> No
     assert ill_exposed([dark, bright, good]) == ill_exposed([]) == ()
 
 
+def test_an_aperture_is_told_where_all_defocused_photographs_have_one() -> None:
+    def at(f_number: float | None, role: Role = "defocused") -> Measured:
+        return Measured(PictureReport("", role, found=True), f_number=f_number)
+
+    assert aperture_of([at(2.8), at(None), at(2.8), at(2.83), at(8.0, "focused")]) == (2.8, ())
+    assert aperture_of([at(None), at(0.0), at(1e9), at(8.0, "focused")]) == aperture_of([]) == (None, ())
+    found, (warning,) = aperture_of([at(2.8), at(2.8), at(4.0)])
+    assert found is None
+    assert warning.startswith("their EXIF says f/2.8 to f/4,")
+
+
 def test_what_is_too_far_out_of_focus_is_said_of_each_and_of_most(taken: list[SheetPhoto]) -> None:
     far, good = (Measured(PictureReport("", "defocused", found=False)) for _ in range(2))
     _, _, pixels = taken[4]  # its circles are 22 px across
@@ -167,7 +177,7 @@ def test_what_is_too_far_out_of_focus_is_said_of_each_and_of_most(taken: list[Sh
 
 
 def test_what_is_no_photograph_is_said_and_the_others_count(taken: list[SheetPhoto]) -> None:
-    def broken() -> NDArray[np.uint8]:
+    def broken() -> Shot:
         raise InvalidImage("The file is empty.")
 
     blank: list[SheetPhoto] = [("blank", "defocused", np.full((600, 800, 3), 90, np.uint8))]

@@ -100,13 +100,22 @@ def test_a_frame_made_larger_scales_gamma_alike() -> None:
     ],
 )
 def test_a_lens_that_is_not_the_camera_s_is_told(exif: Exif, words: str) -> None:
-    assert " ".join(taken_otherwise(exif, Lens(50, 1.2, 6.0, 4000), 2.0)) == words
+    fifty = replace(CAMERA, focal_length_m=0.05, f_number=1.2)
+    assert " ".join(taken_otherwise(exif, fifty, is_refocused=False)) == words
+
+
+def test_another_aperture_than_k_cam_holds_at_is_told_where_no_lens_is_known() -> None:
+    stopped_down = Exif(focal_length_mm=50.0, f_number=5.6)
+    (warning,) = taken_otherwise(stopped_down, replace(CAMERA, f_number=2.0), is_refocused=True)
+    assert warning == "its EXIF says 50 mm f/5.6, the camera is f/2"
+    for same in (replace(CAMERA, f_number=5.59), CAMERA):
+        assert not [*taken_otherwise(stopped_down, same, is_refocused=True)]
 
 
 def test_a_digital_zoom_is_told_of_whatever_the_camera_was_made_from() -> None:
-    (warning,) = taken_otherwise(Exif(digital_zoom=2.0), None, None)
+    (warning,) = taken_otherwise(Exif(digital_zoom=2.0), CAMERA, is_refocused=True)
     assert "digital zoom of 2" in warning
-    assert not [*taken_otherwise(Exif(digital_zoom=1.0), None, None)]
+    assert not [*taken_otherwise(Exif(digital_zoom=1.0), CAMERA, is_refocused=True)]
 
 
 @pytest.mark.parametrize(
@@ -157,7 +166,7 @@ def test_a_lens_focused_close_may_see_less_than_its_equivalent_tells() -> None:
 
 
 def test_a_portrait_mode_is_told_of() -> None:
-    (warning,) = taken_otherwise(Exif(rendering="a portrait mode"), None, None)
+    (warning,) = taken_otherwise(Exif(rendering="a portrait mode"), CAMERA, is_refocused=True)
     assert "portrait mode" in warning
 
 
@@ -179,17 +188,17 @@ def test_another_focus_than_the_camera_s_is_told_of_unless_it_came_with_the_phot
     noted_m: float | None, focal_length_mm: float | None, *, is_other: bool
 ) -> None:
     exif = Exif(focal_length_mm=focal_length_mm, subject_distance_m=noted_m)
-    said = [*taken_otherwise(exif, None, 2.0)]
+    said = [*taken_otherwise(exif, CAMERA, is_refocused=False)]
     assert len(said) == is_other
     noted = "infinity" if noted_m == math.inf else f"{noted_m} m"
     assert all(f"focused at {noted}, the camera at 2 m" in words for words in said)
-    assert not [*taken_otherwise(exif, None, None)]
+    assert not [*taken_otherwise(exif, CAMERA, is_refocused=True)]
 
 
 def test_infinity_agrees_with_any_focus_that_no_ring_has_a_figure_for() -> None:
     infinite = Exif(focal_length_mm=50.0, subject_distance_m=math.inf)
     for focus_m, is_other in ((30.0, True), (50.0, False), (1e5, False)):
-        assert len([*taken_otherwise(infinite, None, focus_m)]) == is_other
+        assert len([*taken_otherwise(infinite, CAMERA.focused_at(focus_m), is_refocused=False)]) == is_other
 
 
 @pytest.mark.parametrize(
@@ -200,7 +209,7 @@ def test_a_macro_lens_may_be_as_much_nearer_than_its_sensor_as_it_is_long(
     noted_m: float, from_lens_m: float, *, is_other: bool
 ) -> None:
     macro = Exif(focal_length_mm=105.0, subject_distance_m=noted_m)
-    assert len([*taken_otherwise(macro, None, from_lens_m)]) == is_other
+    assert len([*taken_otherwise(macro, CAMERA.focused_at(from_lens_m), is_refocused=False)]) == is_other
 
 
 @pytest.mark.parametrize(
@@ -246,7 +255,7 @@ def test_a_focus_distance_that_may_be_in_millimetres_is_told(focus_m: float, *, 
     ids=["full frame", "medium format", "endoscope", "width in mm", "width in um", "pitch of another unit"],
 )
 def test_specs_that_make_no_sensor_are_told(pitch_um: float, width_px: int, *, is_told: bool) -> None:
-    said = [*taken_otherwise(Exif(), Lens(35.0, 1.4, pitch_um, width_px), 2.0)]
+    said = [*maybe_wrong_specs(Lens(35.0, 1.4, pitch_um, width_px), replace(CAMERA, intrinsics=None))]
     assert ["which hardly can be" in words for words in said] == [True] * is_told
 
 

@@ -60,7 +60,7 @@ def test_orientation_is_applied_exactly_once(kind: str, orientation: int) -> Non
 @pytest.mark.parametrize("orientation", TURNS)
 @pytest.mark.parametrize("kind", MAKERS)
 def test_the_stored_frame_is_as_the_sensor_had_it(kind: str, orientation: int) -> None:
-    stored = read_stored_frame(MAKERS[kind](corners(), orientation))
+    stored = read_stored_frame(MAKERS[kind](corners(), orientation)).rgb
     np.testing.assert_array_equal(stored, read_photograph(MAKERS[kind](corners())).rgb)
 
 
@@ -115,7 +115,7 @@ def test_ten_to_fourteen_bits_in_a_file_of_sixteen_are_no_dark_picture(kind: str
         photograph = read_photograph(encoded(kind, pixels))
         assert np.abs(photograph.rgb[..., 0] - ramp / most * 255).max() <= 0.51
         assert [*photograph.warnings] == [f"nothing in its 16 bits is above {most}: read as {bits} bits, and as sRGB"]
-        np.testing.assert_array_equal(read_stored_frame(encoded(kind, pixels)), photograph.rgb)
+        np.testing.assert_array_equal(read_stored_frame(encoded(kind, pixels)).rgb, photograph.rgb)
     brighter = ramp.copy()
     brighter[0, 0] = 16384
     for pixels, brightest in ((brighter, 64), (np.zeros_like(ramp), 0)):
@@ -430,7 +430,7 @@ def test_a_profile_far_from_srgb_is_told_of_and_not_measured_by(kind: str, curve
         with pytest.raises(UnsupportedKind, match=curve):
             read_stored_frame(out.getvalue())
     else:
-        assert read_stored_frame(out.getvalue()).shape == (48, 64, 3)
+        assert read_stored_frame(out.getvalue()).rgb.shape == (48, 64, 3)
 
 
 def test_a_png_s_number_of_its_curve_counts_before_its_profile() -> None:

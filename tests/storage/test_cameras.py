@@ -19,7 +19,7 @@ LENS = Lens(35.0, 2.8, 6.05, 3872, 3.9)
 INTRINSICS = Intrinsics(963.7, 963.1, 321.5, 215.25, (0.1, -0.2, 0.0, 1e-9, 0.3))
 DRAFT = CameraDraft(
     "d200",
-    Camera(645, 432, 2.0, LENS.k_cam_px(2.0, 645), 0.1 + 0.2, LENS.focal_length_m, INTRINSICS),
+    Camera(645, 432, 2.0, LENS.k_cam_px(2.0, 645), 0.1 + 0.2, LENS.focal_length_m, INTRINSICS, 2.8),
     "lens",
     LENS,
     "Größe, 👍",
@@ -27,7 +27,10 @@ DRAFT = CameraDraft(
 PLAIN = CameraDraft("plain", Camera(640, 480, 1.5, 3.81, 0.0), "given")
 
 
-@pytest.mark.parametrize("draft", [DRAFT, PLAIN, replace(PLAIN, source="calibration")])
+CALIBRATED = replace(PLAIN, source="calibration", camera=replace(PLAIN.camera, f_number=5.6))
+
+
+@pytest.mark.parametrize("draft", [DRAFT, PLAIN, CALIBRATED])
 def test_nothing_is_lost(cameras: Cameras, draft: CameraDraft) -> None:
     before = datetime.now(UTC)
     added = cameras.add(draft)

@@ -90,7 +90,8 @@ def test_a_fault_is_shown_at_its_field(page: Page, expected_errors: list[str]) -
 
 
 def test_k_cam_is_moved_with_the_focus_distance(page: Page, served: Server, phone: dict[str, Any]) -> None:
-    open_camera(page, served, phone)
+    open_camera(page, served, phone | {"f_number": 1.85})
+    expect(page.get_by_text("f/1.85", exact=True)).to_be_visible()
     page.get_by_role("button", name="Edit", exact=True).click()
     k_cam, focus = page.get_by_label("k_cam (px)"), page.get_by_label("Focus distance (m)")
     told = page.get_by_text("This k_cam holds at a focus distance of")
@@ -104,7 +105,8 @@ def test_k_cam_is_moved_with_the_focus_distance(page: Page, served: Server, phon
         expect(k_cam).to_have_value(f"{moved:.6g}")
     page.get_by_role("button", name="Save as a new revision").click()
     expect(page.get_by_text("revision 2", exact=True)).to_be_visible()
-    assert read(served, phone["name"])["k_cam_px"] == pytest.approx(moved, rel=1e-5)
+    saved = read(served, phone["name"])
+    assert (saved["k_cam_px"], saved["f_number"]) == (pytest.approx(moved, rel=1e-5), 1.85)
 
 
 @pytest.mark.parametrize(
@@ -315,7 +317,7 @@ def test_what_is_exported_comes_back_after_it_is_shown(
 ) -> None:
     expected_errors.append("status of 422")
     served.add(d200)
-    served.add(phone)
+    served.add(phone | {"f_number": 1.85})
     page.goto("#cameras")
     expect(page.get_by_role("button", name="d200")).to_be_visible()
     with page.expect_download() as download:
@@ -339,7 +341,8 @@ def test_what_is_exported_comes_back_after_it_is_shown(
     expect(plan.get_by_role("status")).to_have_text("2 cameras are stored, 1 refused")
     plan.get_by_role("button", name="Close").click()
     expect(page.get_by_role("button", name="d200")).to_be_visible()
-    assert read(served, phone["name"])["k_cam_px"] == 2.5
+    stored = read(served, phone["name"])
+    assert (stored["k_cam_px"], stored["f_number"]) == (2.5, 1.85)
 
 
 def test_an_import_says_first_that_the_service_does_not_answer(
