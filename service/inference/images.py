@@ -5,6 +5,7 @@ here and nowhere else; a calibration, which measures the lens, asks for the stor
 are decoded in a process of their own.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -79,6 +80,7 @@ UNTURNS = {orientation: {6: 8, 8: 6}.get(orientation, orientation) for orientati
 DECODE_FLAGS = cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 # below which metres go wrong: a jpeg's is the least that the model was trained on, and a webp's filter blurs
 LEAST_QUALITY: dict[Kind, int] = {"jpeg": 60, "webp": 76}
+CLIPPED_LEVEL, CLIPPED_SHARE, CLIPPED_EVERY = 253, 0.25, 4  # of all colours; of the pixels, from where on it is told
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +150,7 @@ def read_photograph(data: bytes, media_type: str | None = None, limits: ImageLim
         warnings += (f"{said}: send what the camera stored",)
     if header.has_few_colours:
         warnings += ("it has a palette's few colours, whose steps are taken for edges: send what the camera stored",)
-    warnings += tuple(signs_of_making(data, header, stored))
+    warnings += (*_overexposed(stored), *signs_of_making(data, header, stored))
     return Photograph(turned(stored, orientation), kind, orientation, warnings, read_exif(header.exif))
 
 
@@ -230,6 +232,14 @@ def _picture(data: bytes, header: Header) -> bytes:
     upright = (1).to_bytes(2, "little" if data[:2] == b"II" else "big")
     stored[header.orientation_offset : header.orientation_offset + 2] = upright
     return bytes(stored)
+
+
+def _overexposed(pixels: NDArray[np.uint8]) -> Iterator[str]:
+    """A warning where much of a picture is white, whose blur is lost and misleads what is beside it."""
+    red, green, blue = np.moveaxis(pixels[::CLIPPED_EVERY, ::CLIPPED_EVERY], 2, 0)
+    share = float(((red >= CLIPPED_LEVEL) & (green >= CLIPPED_LEVEL) & (blue >= CLIPPED_LEVEL)).mean())
+    if share > CLIPPED_SHARE:
+        yield f"{100 * share:.0f} % of it is overexposed, and no blur is seen there: metres may be wrong, beside it too"
 
 
 def _eight_bits(pixels: NDArray[Any]) -> tuple[NDArray[np.uint8], tuple[str, ...]]:

@@ -161,6 +161,15 @@ def test_a_damaged_png_is_refused() -> None:
         read_photograph(bytes(data))
 
 
+@pytest.mark.parametrize(("level", "share", "is_told"), [(255, 0.3, True), (255, 0.2, False), (250, 0.4, False)])
+def test_a_picture_much_of_which_is_white_is_told(level: int, share: float, *, is_told: bool) -> None:
+    picture = np.full((400, 40, 3), 90, np.uint8)
+    picture[: round(400 * share)] = level
+    picture[200:] = (255, 255, 0)  # a colour is none
+    warnings = read_photograph(png(picture)).warnings
+    assert [f"{100 * share:.0f} % of it is overexposed" in words for words in warnings] == [True] * is_told
+
+
 @pytest.mark.parametrize(("quality", "is_told"), [(98, False), (60, False), (59, True), (50, True), (30, True)])
 def test_a_jpeg_coarser_than_the_model_learned_of_is_told(quality: int, *, is_told: bool) -> None:
     data = jpeg(corners(), quality=quality)
