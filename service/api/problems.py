@@ -76,13 +76,13 @@ class Problem(BaseModel):
 
 def problem(error: CamindError) -> Problem:
     """The error as problem details."""
-    errors = [ProblemField(pointer=item.pointer, detail=item.detail) for item in error.errors]
+    return _told(error, error.detail, error.errors)
+
+
+def _told(kind: CamindError | type[CamindError], detail: str, faults: Sequence[FieldProblem]) -> Problem:
+    errors = [ProblemField(pointer=fault.pointer, detail=fault.detail) for fault in faults]
     return Problem(
-        type=TYPE_PREFIX + error.code,
-        title=error.title,
-        status=error.status,
-        detail=error.detail,
-        errors=errors or None,
+        type=TYPE_PREFIX + kind.code, title=kind.title, status=kind.status, detail=detail, errors=errors or None
     )
 
 
@@ -158,10 +158,8 @@ def responses(*errors: type[CamindError]) -> dict[int | str, dict[str, Any]]:
     every: tuple[type[CamindError], ...] = (*errors, CamindError)
     for error in every:
         entry = documented.setdefault(error.status, _empty_entry(error))
-        entry["content"][PROBLEM_TYPE]["examples"][error.code] = {
-            "summary": error.title,
-            "value": _example(error),
-        }
+        example = _told(error, *EXAMPLES[error.code]).model_dump(exclude_none=True)
+        entry["content"][PROBLEM_TYPE]["examples"][error.code] = {"summary": error.title, "value": example}
     return documented
 
 
@@ -175,18 +173,6 @@ def _empty_entry(error: type[CamindError]) -> dict[str, Any]:
         name, kind, meaning = ERROR_HEADERS[error.status]
         entry["headers"] = {name: {"description": meaning, "schema": {"type": kind}}}
     return entry
-
-
-def _example(error: type[CamindError]) -> dict[str, Any]:
-    detail, fields = EXAMPLES.get(error.code, (error.title, ()))
-    shown = Problem(
-        type=TYPE_PREFIX + error.code,
-        title=error.title,
-        status=error.status,
-        detail=detail,
-        errors=[ProblemField(pointer=item.pointer, detail=item.detail) for item in fields] or None,
-    )
-    return shown.model_dump(exclude_none=True)
 
 
 def invalid_request(faults: Sequence[Mapping[str, Any]]) -> BadRequest:
