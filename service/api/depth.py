@@ -43,9 +43,7 @@ router = APIRouter(tags=["depth"])
         200: {
             "model": DepthRead,
             "description": "The depth map, of the size of the upright photograph or of the part asked for",
-            "content": {
-                media_type: {"schema": {"type": "string", "format": "binary"}} for media_type in MEDIA_TYPES.values()
-            },
+            "content": {media_type: {} for media_type in MEDIA_TYPES.values()},
             "headers": {
                 name: {"description": meaning, "schema": {"type": "string"}}
                 for name, meaning in {

@@ -34,7 +34,7 @@ class Order:
     responses={
         200: {
             "description": "The upright photograph, made small",
-            "content": {"image/jpeg": {"schema": {"type": "string", "format": "binary"}}},
+            "content": {"image/jpeg": {}},
         },
         **responses(TooLarge, UnsupportedKind, BadRequest, InvalidImage, Busy),
     },
