@@ -14,7 +14,7 @@ from service.calibration.look import Exposure, Look
 from service.calibration.report import Method, Role
 from service.calibration.target import CircleGrid, Kind
 from service.errors import BadRequest
-from service.storage.calibrations import CalibrationRecord, CalibrationSummary
+from service.storage.calibrations import CalibrationRecord
 
 SETTINGS_FIELD = "settings"
 FocalLengthFrom = Literal["camera", "exif"]
@@ -219,11 +219,6 @@ class CalibrationItem(BaseModel):
     camera_revision: CameraRevision
     created_at: Utc
     updated_at: Utc
-
-    @classmethod
-    def from_summary(cls, summary: CalibrationSummary) -> Self:
-        """The stored summary as it is."""
-        return cls.model_validate(summary, from_attributes=True)
 
 
 class CalibrationPage(BaseModel):

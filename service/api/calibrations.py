@@ -38,7 +38,7 @@ from service.api.openapi import REF
 from service.api.preferences import MOST_WAIT_S, wait_of
 from service.api.problems import STORE_ERRORS, WRITE_ERRORS, responses
 from service.api.schemas import Name
-from service.api.uploads import MULTIPART
+from service.api.uploads import BINARY, MULTIPART
 from service.errors import (
     BadRequest,
     Busy,
@@ -65,7 +65,7 @@ HEADERS = {
     "Preference-Applied": {"description": "The wait that was granted", "schema": {"type": "string"}},
 }
 SETTINGS_SCHEMA = {"$ref": REF.format(model=CalibrationSettings.__name__)}
-FILES = {"type": "array", "items": {"type": "string", "format": "binary"}}
+FILES = {"type": "array", "items": BINARY}
 
 router = APIRouter(tags=["calibration"])
 
@@ -164,7 +164,7 @@ def list_calibrations(
     """Calibrations a page at a time, without images and results."""
     summaries, has_more = calibrations.page(limit, name_of(cursor, ID_PATTERN))
     return CalibrationPage(
-        items=[CalibrationItem.from_summary(summary) for summary in summaries],
+        items=[CalibrationItem.model_validate(summary, from_attributes=True) for summary in summaries],
         next_cursor=cursor_after(summaries[-1].id) if has_more else None,
     )
 
