@@ -11,9 +11,9 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime, timedelta
-from typing import Literal, get_args
+from typing import Literal
 
-from pydantic import JsonValue
+from pydantic import JsonValue, TypeAdapter
 from sqlalchemy import Engine, delete, func, update
 from sqlalchemy.orm import aliased
 from sqlmodel import Session, col, select
@@ -29,7 +29,7 @@ from service.storage.tables import CalibrationRow
 
 State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 EndState = Literal["succeeded", "failed", "cancelled"]
-STATES: tuple[State, ...] = get_args(State)
+STATE: TypeAdapter[State] = TypeAdapter(State)
 LIVE: tuple[State, ...] = ("queued", "running")
 
 ID_PATTERN = r"^[0-9a-f]{32}$"
@@ -245,7 +245,7 @@ class Calibrations:
         """Cancel what has not ended; the state before. Raises ``NotFound``."""
         with writing(self._engine) as session:
             row = _require_row(session, calibration_id, self._owner, lock=True)
-            before = _to_state(row.state)
+            before = STATE.validate_python(row.state)
             if before in LIVE:
                 row.state = "cancelled"
                 _changed(session, row)
@@ -390,7 +390,7 @@ def _to_record(row: CalibrationRow) -> CalibrationRecord:
     pictures = tuple(StoredPicture(picture["name"], picture["role"]) for picture in row.pictures)
     return CalibrationRecord(
         draft=CalibrationDraft(row.id, row.spool, row.camera, row.settings, pictures),
-        state=_to_state(row.state),
+        state=STATE.validate_python(row.state),
         progress=row.progress,
         images=row.images,
         result=row.result,
@@ -401,10 +401,3 @@ def _to_record(row: CalibrationRow) -> CalibrationRecord:
         created_at=row.created_at,
         updated_at=row.updated_at,
     )
-
-
-def _to_state(value: str) -> State:
-    for state in STATES:
-        if state == value:
-            return state
-    raise ValueError(f"a stored calibration has the unknown state {value!r}")

@@ -8,8 +8,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Literal, get_args
+from typing import Literal
 
+from pydantic import TypeAdapter
 from sqlalchemy import BindParameter, Engine, bindparam, func
 from sqlmodel import Session, col, select
 from sqlmodel.sql.expression import Select
@@ -25,7 +26,7 @@ NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 DEFAULT_K_R = 4.0
 
 Source = Literal["given", "lens", "calibration"]
-SOURCES: tuple[Source, ...] = get_args(Source)
+SOURCE: TypeAdapter[Source] = TypeAdapter(Source)
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,31 +205,28 @@ def _find_row(session: Session, owner: str, name: str, *, lock: bool = False) ->
     return session.exec(query.with_for_update() if lock else query).first()
 
 
-def _live(row: CameraRow | None, name: str) -> CameraRow:
-    if row is None or row.deleted_at is not None:
-        raise _unknown(name)
-    return row
-
-
 def _require_row(session: Session, owner: str, name: str, expected: Sequence[int] | None) -> CameraRow:
     """The row, locked until the end of the transaction, at one of the expected revisions."""
-    row = _live(_find_row(session, owner, name, lock=True), name)
+    row = _find_row(session, owner, name, lock=True)
+    if row is None or row.deleted_at is not None:
+        raise _unknown(name)
     if expected is not None and row.revision not in expected:
         remedy = f'read it again, then repeat with If-Match: "{row.revision}"'
         raise PreconditionFailed(f"Camera '{name}' is at revision {row.revision}: {remedy}.")
     return row
 
 
+_WITH_REVISIONS = select(CameraRow, CameraRevisionRow).join(
+    CameraRevisionRow, col(CameraRevisionRow.camera_id) == col(CameraRow.id)
+)
+
+
 def _all_current(owner: str | BindParameter[str]) -> Select[CameraRow, CameraRevisionRow]:
     """The cameras that an owner has, each with its current revision."""
-    return (
-        select(CameraRow, CameraRevisionRow)
-        .join(CameraRevisionRow, col(CameraRevisionRow.camera_id) == col(CameraRow.id))
-        .where(
-            col(CameraRevisionRow.revision) == col(CameraRow.revision),
-            col(CameraRow.owner) == owner,
-            col(CameraRow.deleted_at).is_(None),
-        )
+    return _WITH_REVISIONS.where(
+        col(CameraRevisionRow.revision) == col(CameraRow.revision),
+        col(CameraRow.owner) == owner,
+        col(CameraRow.deleted_at).is_(None),
     )
 
 
@@ -243,19 +241,12 @@ def _current(session: Session, owner: str, name: str) -> tuple[CameraRow, Camera
     return found
 
 
-def _revision(session: Session, row: CameraRow, number: int) -> CameraRevisionRow:
-    query = select(CameraRevisionRow).where(
-        col(CameraRevisionRow.camera_id) == row.id, col(CameraRevisionRow.revision) == number
-    )
-    return session.exec(query).one()
-
-
 def _as_added(session: Session, owner: str, name: str, number: int) -> CameraRecord:
     """A camera as it was when it was added, whatever became of it since."""
-    row = _find_row(session, owner, name)
-    if row is None:
-        raise RuntimeError("a camera that was added has no row")
-    return _to_past(row, _revision(session, row, number))
+    query = _WITH_REVISIONS.where(
+        col(CameraRow.owner) == owner, col(CameraRow.name) == name, col(CameraRevisionRow.revision) == number
+    )
+    return _to_past(*session.exec(query).one())
 
 
 def _write_revision(session: Session, row: CameraRow, draft: CameraDraft, now: datetime) -> CameraRecord:
@@ -309,7 +300,7 @@ def _to_record(row: CameraRow, revision: CameraRevisionRow) -> CameraRecord:
         f_number=revision.f_number,
         intrinsics=_to_intrinsics(revision),
     )
-    draft = CameraDraft(row.name, camera, _to_source(revision.source), lens, revision.description)
+    draft = CameraDraft(row.name, camera, SOURCE.validate_python(revision.source), lens, revision.description)
     return CameraRecord(draft, revision.revision, row.created_at, row.updated_at)
 
 
@@ -328,10 +319,3 @@ def _to_intrinsics(row: CameraRevisionRow) -> Intrinsics | None:
     if row.fx_px is None or row.fy_px is None or row.cx_px is None or row.cy_px is None:
         return None
     return Intrinsics(row.fx_px, row.fy_px, row.cx_px, row.cy_px, tuple(row.distortion or ()))
-
-
-def _to_source(value: str) -> Source:
-    for source in SOURCES:
-        if source == value:
-            return source
-    raise ValueError(f"a stored camera has the unknown source {value!r}")
