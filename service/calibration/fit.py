@@ -72,10 +72,6 @@ class Circles:
         """Those at the given places."""
         return Circles(*(getattr(self, column.name)[where] for column in fields(self)))
 
-    def scaled(self, *, depth: float, blur: float) -> "Circles":
-        """The same, all depths and all blur times a factor."""
-        return replace(self, depth_m=self.depth_m * depth, blur_px=self.blur_px * blur)
-
     def excess(self, focus_m: float) -> Array:
         """|s1/z - 1|, 0 where the lens was focused on the sheet."""
         return np.where(self.is_focused, 0.0, thin_lens.relative_defocus(self.depth_m, focus_m))
@@ -315,8 +311,8 @@ def _resampled(circles: Circles, fit: Fit, best: Array, focus_m: float | None, d
         depth, shape, trend = np.array([depth_error, SHAPE_ERROR, TREND_ERROR]) * rng.standard_normal(3)
         of_picture, slope = (error * rng.standard_normal(number.max() + 1)[number] for error in errors[:2])
         off = shape + trend * doublings + of_picture + slope * offset + errors[2] * rng.standard_normal(number.size)
-        some = replace(shown, blur_px=shown.blur_px * np.exp(off))
-        row = fit(some.scaled(depth=math.exp(depth), blur=1.0), best).copy()
+        some = replace(shown, depth_m=shown.depth_m * math.exp(depth), blur_px=shown.blur_px * np.exp(off))
+        row = fit(some, best).copy()
         row[1] += PIXEL_ERROR_PX * rng.standard_normal()
         row[2] *= 1 + focus_error * rng.standard_normal()
         rows.append(row)
