@@ -47,10 +47,7 @@ from service.storage.keys import Keys
 from service.storage.spool import Spool
 from service.tracing import Tracing
 
-DEPTH_PATH = "/depth"
-FROM_PHOTO_PATH = "/cameras/from-photo"
-LOOK_PATH = "/calibrate/look"
-PREVIEW_PATH = "/photographs/preview"
+PHOTOGRAPH_PATHS = ("/depth", "/cameras/from-photo", "/calibrate/look", "/photographs/preview")
 CALIBRATE_PATH = "/calibrate"
 DESCRIPTION = """\
 How far away is each pixel of this single photograph, in metres, given the camera that took it?
@@ -110,10 +107,7 @@ def _add_middleware(app: FastAPI, settings: Settings) -> None:
         LimitRequests,
         limits=BodyLimits(settings.max_json_bytes, settings.receive_deadline_s),
         limits_by_path={
-            DEPTH_PATH: photograph,
-            FROM_PHOTO_PATH: photograph,
-            LOOK_PATH: photograph,
-            PREVIEW_PATH: photograph,
+            **dict.fromkeys(PHOTOGRAPH_PATHS, photograph),
             CALIBRATE_PATH: BodyLimits(settings.max_calibration_bytes, settings.calibration_receive_deadline_s),
         },
     )
