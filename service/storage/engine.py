@@ -39,8 +39,7 @@ def open_engine(database_url: str | URL) -> Engine:
     url = make_url(database_url)
     if url.get_backend_name() != "sqlite":
         return _open_postgresql(url)
-    if url.database and url.database != ":memory:":
-        make_private(Path(url.database).parent)
+    make_private(Path(str(url.database)).parent)
     engine = create_engine(url, pool_timeout=POOL_TIMEOUT_S, hide_parameters=True)
     event.listen(engine, "do_connect", _make_file_private)
     event.listen(engine, "connect", _prepare_sqlite)
@@ -54,11 +53,9 @@ def _make_file_private(_dialect: object, _record: object, arguments: Sequence[st
     A file that is there is not opened: closing it would take the locks from under this process' other connections
     (https://www.sqlite.org/howtocorrupt.html, 2.2).
     """
-    file = arguments[0]
-    if not file.startswith((":memory:", "file:")):
-        # SQLite says better why a file cannot be made
-        with suppress(OSError):
-            os.close(os.open(file, os.O_RDONLY | os.O_CREAT | os.O_EXCL, 0o600))
+    # SQLite says better why a file cannot be made
+    with suppress(OSError):
+        os.close(os.open(arguments[0], os.O_RDONLY | os.O_CREAT | os.O_EXCL, 0o600))
 
 
 def _open_postgresql(url: URL) -> Engine:
