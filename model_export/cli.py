@@ -214,7 +214,7 @@ def export(
 
     pictures = [folder for folder in (textures, frames) if folder is not None]
     # what breaks off leaves no folder that serves, without its corrections
-    with TemporaryDirectory() as scratch, progress_bar(Console(stderr=True)) as progress, _plain_failures():
+    with TemporaryDirectory() as scratch, progress_bar() as progress, _plain_failures():
         built = Path(scratch)
         task = progress.add_task("float32", total=4)
         manifest = export_checkpoint(checkpoint, pictures, built, name)
@@ -288,7 +288,7 @@ def evaluate(
             sets = evaluation_sets(data, quick)
     if missing := [name for name in FOLDERS if not any(each.name.startswith(name) for each in sets)]:
         typer.secho(f"{data} has no pictures of {', '.join(missing)}: without them", err=True)
-    with progress_bar(Console(stderr=True)) as progress, _plain_failures():
+    with progress_bar() as progress, _plain_failures():
         task = progress.add_task("loading", total=len(sets))
         found = run_evaluation(
             models, sets, lambda said, finished: progress.update(task, description=said, advance=finished)
@@ -341,7 +341,7 @@ def speed(
         load_model_folder(model)
         if out is not None:
             out.parent.mkdir(parents=True, exist_ok=True)
-    with progress_bar(Console(stderr=True)) as progress:
+    with progress_bar() as progress:
         task = progress.add_task("measuring", total=bench_speed.steps(rounds))
         report = bench_speed.measure(model, rounds, seconds, lambda: progress.advance(task))
     _print(bench_speed.tables(report))
@@ -365,7 +365,7 @@ def calibration(
 
     stdout = Console()
     with (
-        progress_bar(Console(stderr=True)) as progress,
+        progress_bar() as progress,
         ProcessPoolExecutor(workers, get_context("forkserver"), initializer=one_core) as pool,
     ):
         found = list(
@@ -397,7 +397,7 @@ def blender(
     edges, rooms = cycles.edges(), cycles.rooms(scenes)
     raw = out / "raw"
     try:
-        with progress_bar(Console(stderr=True)) as progress:
+        with progress_bar() as progress:
             task = progress.add_task("Blender", total=None)
             python = blender_environment.environment(environment)
             progress.update(task, description="rendering", total=len(edges) + len(rooms))
@@ -433,7 +433,7 @@ def homes(
         from model_export.datasets import homes as furnished
 
     try:
-        with progress_bar(Console(stderr=True)) as progress:
+        with progress_bar() as progress:
             task = progress.add_task("Blender", total=None)
             python = blender_environment.environment(environment)
             models = furnished.unpack(furniture, out / "models")
@@ -457,6 +457,6 @@ def data(
         from model_export.datasets.photos import save_photos
 
     photos = {"defocusnet": defocusnet.photos, "ddff12": ddff12.photos, "nyu": nyu.photos}[dataset]
-    with progress_bar(Console(stderr=True)) as progress, _plain_failures():
+    with progress_bar() as progress, _plain_failures():
         written = save_photos(out, progress.track(photos(source), total=None, description=dataset))
     typer.echo(f"{out}: {written} pictures")

@@ -174,7 +174,7 @@ def narrow(
     wide, material = restored(model), Material(load_photographs(textures))
     require_fewer(wide, widths)
     pool = Pool(config, material, 0, workers=1)
-    with progress_bar(console or Console(stderr=True)) as progress:
+    with progress_bar(console) as progress:
         for _ in progress.track(pool.fill(), total=config.pool, description="scenes"):
             pass
         batches = list(pool.settling())
