@@ -3,7 +3,6 @@
 import copy
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from pathlib import Path
 
 import onnx
@@ -33,12 +32,11 @@ def norm_gain(norm: nn.BatchNorm2d) -> Tensor:
 
 def folded(pair: Pair) -> Pair:
     """A copy of a pair, in evaluation mode, that answers the same to rounding."""
-    blur, depth = copy.deepcopy(pair.blur).eval(), copy.deepcopy(pair.depth).eval()
-    for network in (blur, depth):
-        for module in network.modules():
-            if isinstance(module, Normed):
-                _fold(module)
-    return replace(pair, blur=blur, depth=depth)
+    pair = copy.deepcopy(pair)
+    pair.modules().eval()
+    for layer in _normed(pair):
+        _fold(layer)
+    return pair
 
 
 def _fold(normed: Normed) -> None:
