@@ -85,7 +85,7 @@ def find_grid(grey: NDArray[np.uint8], grid: CircleGrid, check: Callable[[], Non
         try:
             found = _find(_smaller(grey, ratio), grid, check)
         except GridError as error:
-            nearest = error if _says_more(error, nearest) else nearest
+            nearest = max(nearest, error, key=lambda one: len(str(one)))
         else:
             return _checked(found, ratio, grid)
         if side >= min(FINEST_PX, longest):
@@ -99,10 +99,6 @@ def _smaller(grey: NDArray[np.uint8], ratio: float) -> NDArray[np.uint8]:
     if ratio == 1:
         return grey
     return np.asarray(cv2.resize(grey, None, fx=ratio, fy=ratio, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def _says_more(error: GridError, other: GridError) -> bool:
-    return len(str(error)) > len(str(other))
 
 
 def _checked(found: FoundGrid, ratio: float, grid: CircleGrid) -> FoundGrid:

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from service.calibration.report import Result, Sample
+from service.calibration.report import Result
 
 INCHES = (13.0, 4.6)
 BLUE, ORANGE, GREY = "#1f5fa8", "#d9730d", "#8a8a8a"
@@ -27,13 +27,10 @@ def as_svg(result: Result) -> bytes:
     return file.getvalue()
 
 
-def _split(samples: tuple[Sample, ...]) -> tuple[list[Sample], list[Sample]]:
-    return [s for s in samples if s.used], [s for s in samples if not s.used]
-
-
 def _blur(axes: Axes, result: Result) -> None:
     """Lambda against 1/z: the measured circles, outliers as crosses, the fitted curve and its interval."""
-    used, outliers = _split(result.samples)
+    used = [s for s in result.samples if s.used]
+    outliers = [s for s in result.samples if not s.used]
     nearness = [1 / point.depth_m for point in result.curve]
     axes.fill_between(
         nearness, [p.low_px for p in result.curve], [p.high_px for p in result.curve], color=ORANGE, alpha=0.25, lw=0
