@@ -3,7 +3,7 @@
 import platform
 import tempfile
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import onnxruntime
@@ -34,9 +34,6 @@ class SpeedReport:
     requests: list[RequestRow]
     load: list[LoadRow]
     peak_memory_mb: dict[str, float]
-
-    def as_dict(self) -> dict[str, object]:
-        return asdict(self)
 
     def share_of_machine(self, row: NetworkRow) -> float:
         """What the graphs compute in a second over the best rate of any library with such numbers and threads."""

@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -346,7 +347,7 @@ def speed(
         report = bench_speed.measure(model, rounds, seconds, lambda: progress.advance(task))
     _print(bench_speed.tables(report))
     if out is not None:
-        out.write_text(json.dumps(report.as_dict(), indent=2) + "\n")
+        out.write_text(json.dumps(asdict(report), indent=2) + "\n")
 
 
 @bench.command()

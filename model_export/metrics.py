@@ -1,7 +1,7 @@
 """Scores of depth maps: the paper's, pooled over pixels and averaged over images, with unanswered pixels counted."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, astuple, dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +21,6 @@ class Scores:
     delta1: float
     delta2: float
     delta3: float
-
-    def as_dict(self) -> dict[str, float]:
-        return asdict(self)
 
 
 def score(depth_m: Map, truth_m: Map) -> Scores:

@@ -72,7 +72,7 @@ def _relief_rows(s: Summary) -> list[list[str]]:
 
 def _score_rows(s: Summary) -> list[list[str]]:
     ways = {"pixels": s.pooled, "pictures": s.mean}
-    return [[*_camera(s), way, *(f"{v:.3f}" for v in scores.as_dict().values())] for way, scores in ways.items()]
+    return [[*_camera(s), way, *(f"{v:.3f}" for v in asdict(scores).values())] for way, scores in ways.items()]
 
 
 def _blur_row(b: BlurRange) -> list[str]:

@@ -175,7 +175,7 @@ class Summary:
         shares = {"kept_abs_rel": dict(zip(KEPT_SHARES, self.kept_abs_rel, strict=True)), "within": within}
         parts = {"sides": self.sides, "relief": self.relief}
         told = {name: asdict(part) if part else None for name, part in parts.items()}
-        scores = {n: getattr(self, n).as_dict() for n in tables}
+        scores = {n: asdict(getattr(self, n)) for n in tables}
         return {n: getattr(self, n) for n in plain} | scores | shares | told
 
 
