@@ -154,7 +154,7 @@ def slice_blur(light: NDArray[np.float32], x_px: float, y_px: float, radius_px: 
 
     A horizontal slice through the disc's middle is scaled to 0..1 (the disc being 1); what is below 0.95 is taken for
     two halves of a Gaussian, whose integral is lambda sqrt(2 pi). It is half of two error functions, of 1.6657 lambda
-    each. Raises ``EdgeError`` for a disc at the border.
+    each. Raises ``EdgeError`` for a disc at the border, or for none.
     """
     reach = REACH_RADII * radius_px
     left, right, row = math.floor(x_px - reach), math.ceil(x_px + reach) + 1, round(y_px)

@@ -128,7 +128,8 @@ def fit_constants(
 
     ``depth_error`` is the relative standard error that all depths have in common, as from the focal length; without
     ``resamples`` the intervals have no width. ``tick`` is called now and then. Raises ``FitError`` for fewer than four
-    circles, for circles that show no blur by defocus, and where k_cam may be more than ten times as much as not.
+    circles, for circles that show no blur by defocus or surely another focus than the one given, and where k_cam may
+    be more than ten times as much as not.
     """
     defocused = ~circles.is_focused
     if defocused.sum() < LEAST_CIRCLES:
@@ -197,7 +198,7 @@ def odd_pictures(circles: Circles, constants: Constants) -> list[int]:
 def fit_as_paper(circles: Circles, focus_distance_m: float, *, depth_error: float, resamples: int) -> Constants:
     """The paper's procedure: gamma from the focused pictures, k_cam of each defocused circle, outliers out, median.
 
-    Raises ``FitError`` without focused and defocused circles.
+    Raises ``FitError`` without focused and defocused circles, and where these show no blur by defocus, or hardly any.
     """
     if circles.is_focused.sum() < LEAST_CIRCLES or (~circles.is_focused).sum() < LEAST_CIRCLES:
         raise FitError("the paper's method needs circles of focused and of defocused pictures")

@@ -57,7 +57,7 @@ def place(grid: CircleGrid, views: Sequence[View], size_px: tuple[int, int]) -> 
     """Intrinsics and poses of the views of one camera with pictures of ``size_px`` (width, height).
 
     What an imaged circle's middle is off from its centre's image under perspective is taken out. Raises ``PoseError``
-    if there is nothing to place.
+    for too few views, or such as no camera would have or as tell no focal length.
     """
     if len(views) < LEAST_VIEWS:
         raise PoseError(

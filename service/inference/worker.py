@@ -35,9 +35,7 @@ class Outcome(Generic[T]):
 class Worker:
     """Runs functions that take a ``Cancellation`` first, those of each line in their order, and the lines in turn.
 
-    Made and closed with the app.
-
-    ``tell_wait`` is told the seconds each waited for its slot, from the slot's thread.
+    Made and closed with the app. ``tell_wait`` is told the seconds each waited for its slot, from the slot's thread.
     """
 
     def __init__(
@@ -81,7 +79,7 @@ class Worker:
         """Run the work in a slot; cancelling the awaiting task asks the work to stop.
 
         ``line`` is whose it is, None where there is no other. Raises ``Busy`` when the queue is full, the line has its
-        share of it or the deadline passes, and whatever the work raises.
+        share of it, the deadline passes or the service stops, and whatever the work raises.
         """
         cancellation = self._admit(line)
         future = self._submit(line, cancellation, lambda: work(cancellation, *args, **kwargs))
