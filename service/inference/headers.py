@@ -119,7 +119,7 @@ def read_header(data: bytes) -> Header:
     try:
         header = PARSERS[kind](data)
     except (struct.error, IndexError) as exc:
-        raise InvalidImage.cut_off(str(kind)) from exc
+        raise InvalidImage.cut_off(kind) from exc
     if header.width_px < 1 or header.height_px < 1:
         raise InvalidImage(f"The {header.kind} file states a size of {header.width_px}x{header.height_px} pixels.")
     return header
