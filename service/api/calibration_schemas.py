@@ -240,21 +240,7 @@ class CalibrationRead(CalibrationItem):
     @classmethod
     def from_record(cls, record: CalibrationRecord) -> Self:
         """The stored calibration."""
-        return cls.model_validate(
-            {
-                "id": record.id,
-                "camera": record.draft.camera,
-                "state": record.state,
-                "progress": record.progress,
-                "problem": record.problem,
-                "camera_revision": record.camera_revision,
-                "created_at": record.created_at,
-                "updated_at": record.updated_at,
-                "settings": record.draft.settings,
-                "images": record.images,
-                "result": record.result,
-            }
-        )
+        return cls.model_validate(record, from_attributes=True)
 
 
 def _in_field(fault: dict[str, object]) -> dict[str, object]:

@@ -232,7 +232,7 @@ def accept_calibration(record: FoundDep, calibrations: CalibrationsDep, body: Ac
     if record.result is None:
         raise Conflict(f"This calibration is {record.state} and has no result: only one that succeeded is accepted.")
     camera = RESULT.validate_python(record.result).to_camera()
-    return CalibrationRead.from_record(calibrations.accept(record.id, body.camera or record.draft.camera, camera))
+    return CalibrationRead.from_record(calibrations.accept(record.id, body.camera or record.camera, camera))
 
 
 @router.delete(

@@ -1,5 +1,6 @@
 """Cameras on the wire. Unknown fields, strings for numbers, NaN and infinity are refused."""
 
+from dataclasses import asdict
 from datetime import datetime
 from typing import Annotated, Self
 
@@ -99,13 +100,7 @@ class IntrinsicsRead(BaseModel):
     @classmethod
     def from_domain(cls, intrinsics: Intrinsics) -> Self:
         """The intrinsics as the physics has them."""
-        return cls(
-            fx_px=intrinsics.fx_px,
-            fy_px=intrinsics.fy_px,
-            cx_px=intrinsics.cx_px,
-            cy_px=intrinsics.cy_px,
-            distortion=list(intrinsics.distortion),
-        )
+        return cls.model_validate(intrinsics, from_attributes=True)
 
 
 class CameraSpecs(Given):
@@ -389,13 +384,5 @@ def _fx_px(draft: CameraDraft) -> float | None:
 
 
 def _lens_read(lens: Lens | None) -> LensSpecs | None:
-    if lens is None:
-        return None
     # what is stored was good when it was: no bound is set to it
-    return LensSpecs.model_construct(
-        focal_length_mm=lens.focal_length_mm,
-        f_number=lens.f_number,
-        pixel_pitch_um=lens.pixel_pitch_um,
-        sensor_width_px=lens.sensor_width_px,
-        k_r=lens.k_r,
-    )
+    return LensSpecs.model_construct(**asdict(lens)) if lens else None

@@ -78,6 +78,14 @@ class CalibrationRecord:
         return self.draft.id
 
     @property
+    def camera(self) -> str:
+        return self.draft.camera
+
+    @property
+    def settings(self) -> JsonValue:
+        return self.draft.settings
+
+    @property
     def has_ended(self) -> bool:
         return self.state not in LIVE
 
