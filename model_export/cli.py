@@ -16,7 +16,7 @@ from rich.table import Column, Table
 
 from model_export.config import MOST_SEED, Kind, Part
 from model_export.progress import progress_bar
-from service.config import INT8
+from service.config import INT8, SHIPPED_MODEL
 from service.inference.artifact import load_model_folder
 
 if TYPE_CHECKING:  # importing torch takes seconds; a command that needs it does so itself
@@ -58,7 +58,6 @@ CheckpointPath = Annotated[Path, typer.Option(help="checkpoint file of a run, or
 
 BLENDER_ENVIRONMENT = Path(".venv-blender")
 FILE_COLUMNS = 160
-DEFAULT_MODEL = Path(__file__).parents[1] / "service" / "models"
 
 
 def _fail(message: str) -> typer.Exit:
@@ -158,7 +157,7 @@ def narrow(
     out: Annotated[Path, typer.Option(help="checkpoint file to write, for train --weights", dir_okay=False)],
     blur: Annotated[str, typer.Option(help="channels of the blur network, finest level first: 16-32-48-96")],
     depth: Annotated[str, typer.Option(help="channels of the depth network: 16-16-16-48")],
-    model: Model = DEFAULT_MODEL,
+    model: Model = SHIPPED_MODEL,
 ) -> None:
     """Leave channels out of the compact pair: what they say is written as sums of the others, then trained on from."""
     with _training_parts():
@@ -235,7 +234,7 @@ def export(
 
 
 @commands.command()
-def verify(checkpoint: CheckpointPath, model: Model = DEFAULT_MODEL) -> None:
+def verify(checkpoint: CheckpointPath, model: Model = SHIPPED_MODEL) -> None:
     """Compare torch with ONNX Runtime on three sizes; fails above 1e-3 relative."""
     with _training_parts():
         from model_export.verify import TOLERANCE, verify_checkpoint
@@ -258,7 +257,7 @@ def _differences(differences: "list[Difference]") -> Table:
 @commands.command()
 def evaluate(
     data: Data,
-    model: Model = DEFAULT_MODEL,
+    model: Model = SHIPPED_MODEL,
     beside: Annotated[
         Path | None, typer.Option(help="another model folder, to be compared on the same pictures", file_okay=False)
     ] = None,
@@ -327,7 +326,7 @@ def _as_table(title: str, head: list[str], rows: list[list[str]]) -> Table:
 @bench.callback()
 def speed(
     context: typer.Context,
-    model: Model = DEFAULT_MODEL,
+    model: Model = SHIPPED_MODEL,
     rounds: Annotated[int, typer.Option(min=2, help="times that everything is timed, in turns")] = 10,
     seconds: Annotated[float, typer.Option(min=1, help="how long each number of clients asks")] = 10.0,
     out: Annotated[Path | None, typer.Option(help="JSON file to write", dir_okay=False, writable=True)] = None,
