@@ -56,25 +56,21 @@ Tensors: TypeAlias = "Tensor | tuple[Tensors, ...]"
 logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
 
 
-class _BlurGraph(nn.Module):
-    """The blur network with its outputs in the graph's order."""
+class _Graph(nn.Module):
+    """A network, or a part of one, with inputs and outputs in the graph's order."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
         self.network = network
 
+
+class _BlurGraph(_Graph):
     def forward(self, image: Tensor) -> tuple[Tensor, ...]:
         out = self.network(image)
         return (out.blur_px, out.log_error, *out.features)
 
 
-class _DepthGraph(nn.Module):
-    """The depth network with its inputs and outputs in the graph's order."""
-
-    def __init__(self, network: nn.Module) -> None:
-        super().__init__()
-        self.network = network
-
+class _DepthGraph(_Graph):
     def forward(
         self, defocus: Tensor, spread: Tensor, focus: Tensor, focal: Tensor, side: Tensor, features: Features
     ) -> tuple[Tensor, ...]:
@@ -83,12 +79,8 @@ class _DepthGraph(nn.Module):
         return out.log_ratio_near, out.log_ratio_far, torch.sigmoid(out.near_logit), out.log_scale, *layout
 
 
-class _LayoutGraph(nn.Module):
+class _LayoutGraph(_Graph):
     """What the depth network says of the layout, for a map that is put together of several."""
-
-    def __init__(self, network: nn.Module) -> None:
-        super().__init__()
-        self.network = network
 
     def forward(self, layout_map: Tensor) -> tuple[Tensor, ...]:
         return (self.network(layout_map),)
