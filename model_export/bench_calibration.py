@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.table import Table
 
 from model_export.photographed_sheets import (
@@ -33,8 +32,6 @@ PAPER_SIGMA = 0.3
 PAPER_FOCUS_M = 2.0
 PAPER_DEPTHS_M = np.linspace(0.1, 2.0, 200)
 PAPER_GRID = CircleGrid("asymmetric_circles", 7, 3, 60.0, 40.0)
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

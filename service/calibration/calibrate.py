@@ -27,7 +27,6 @@ from service.calibration.solve import FEW_VIEWS
 from service.calibration.target import CircleGrid
 from service.errors import CamindError
 
-Array = NDArray[np.float64]
 Tell = Callable[[float, tuple[PictureReport, ...]], None]
 
 FITTING_PART = 0.2  # of the progress
