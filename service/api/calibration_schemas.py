@@ -14,20 +14,13 @@ from service.calibration.look import Exposure, Look
 from service.calibration.report import Method, Role
 from service.calibration.target import CircleGrid, Kind
 from service.errors import BadRequest
-from service.storage.calibrations import CalibrationRecord
+from service.storage.calibrations import CalibrationRecord, State
 
 SETTINGS_FIELD = "settings"
 FocalLengthFrom = Literal["camera", "exif"]
 
 Circles = Annotated[int, Field(ge=2, le=40)]
 Millimetres = Annotated[float, Field(gt=0, le=1_000, allow_inf_nan=False)]
-State = Annotated[
-    Literal["queued", "running", "succeeded", "failed", "cancelled"],
-    Field(description="The last three are final"),
-]
-Progress = Annotated[float, Field(ge=0, le=1)]
-Problem = Annotated[str | None, Field(description="Why there is no result, once it has failed")]
-CameraRevision = Annotated[int | None, Field(description="The revision it gave the camera, where it registered one")]
 Utc = Annotated[datetime, Field(description="UTC")]
 
 
@@ -213,10 +206,12 @@ class CalibrationItem(BaseModel):
 
     id: str
     camera: Name
-    state: State
-    progress: Progress
-    problem: Problem
-    camera_revision: CameraRevision
+    state: Annotated[State, Field(description="The last three are final")]
+    progress: Annotated[float, Field(ge=0, le=1)]
+    problem: Annotated[str | None, Field(description="Why there is no result, once it has failed")]
+    camera_revision: Annotated[
+        int | None, Field(description="The revision it gave the camera, where it registered one")
+    ]
     created_at: Utc
     updated_at: Utc
 
