@@ -27,9 +27,22 @@ from service.storage.spool import Spool
 MOST_PARAMETERS = 1_200  # more than all that any route takes, its lists filled
 
 
-async def get_settings(request: Request) -> Settings:
-    settings: Settings = request.app.state.settings
-    return settings
+def _of_app(name: str) -> params.Depends:
+    """A part of the running app, by its name in the app's state."""
+
+    async def get(request: Request) -> object:
+        part: object = getattr(request.app.state, name)
+        return part
+
+    return params.Depends(get)
+
+
+SettingsDep = Annotated[Settings, _of_app("settings")]
+ModelDep = Annotated[ModelFolder, _of_app("model")]
+EstimatorDep = Annotated[Estimator, _of_app("estimator")]
+SpoolDep = Annotated[Spool, _of_app("spool")]
+RunnerDep = Annotated[Runner, _of_app("runner")]
+FollowersDep = Annotated[Followers, _of_app("followers")]
 
 
 async def get_owner(request: Request) -> str:
@@ -37,54 +50,36 @@ async def get_owner(request: Request) -> str:
     return principal.owner
 
 
-async def get_cameras(request: Request, owner: Annotated[str, Depends(get_owner)]) -> Cameras:
-    return Cameras(request.app.state.engine, owner)
-
-
-async def get_model(request: Request) -> ModelFolder:
-    model: ModelFolder = request.app.state.model
-    return model
-
-
-async def get_estimator(request: Request) -> Estimator:
-    estimator: Estimator = request.app.state.estimator
-    return estimator
-
-
 async def get_sharer(request: Request) -> str | None:
     principal: Principal = request.state.principal
     return principal.sharer
 
 
-async def get_worker(request: Request, sharer: Annotated[str | None, Depends(get_sharer)]) -> Worker:
+OwnerDep = Annotated[str, Depends(get_owner)]
+SharerDep = Annotated[str | None, Depends(get_sharer)]
+
+
+async def get_worker(request: Request, sharer: SharerDep) -> Worker:
     """The worker, while it has room: a full queue is told before a photograph is received. Raises ``Busy``."""
     worker: Worker = request.app.state.worker
     worker.require_room(sharer)
     return worker
 
 
-async def get_calibrations(request: Request, owner: Annotated[str, Depends(get_owner)]) -> Calibrations:
+async def get_cameras(request: Request, owner: OwnerDep) -> Cameras:
+    return Cameras(request.app.state.engine, owner)
+
+
+async def get_calibrations(request: Request, owner: OwnerDep) -> Calibrations:
     return Calibrations(request.app.state.engine, owner)
 
 
-async def get_spool(request: Request) -> Spool:
-    spool: Spool = request.app.state.spool
-    return spool
+WorkerDep = Annotated[Worker, Depends(get_worker)]
+CamerasDep = Annotated[Cameras, Depends(get_cameras)]
+CalibrationsDep = Annotated[Calibrations, Depends(get_calibrations)]
 
 
-async def get_runner(request: Request) -> Runner:
-    runner: Runner = request.app.state.runner
-    return runner
-
-
-async def get_followers(request: Request) -> Followers:
-    followers: Followers = request.app.state.followers
-    return followers
-
-
-async def count_follower(
-    owner: Annotated[str, Depends(get_owner)], followers: Annotated[Followers, Depends(get_followers)]
-) -> AsyncIterator[None]:
+async def count_follower(owner: OwnerDep, followers: FollowersDep) -> AsyncIterator[None]:
     """Count the request until its answer is whole. Raises ``Busy``."""
     with followers.counted(owner):
         yield
@@ -130,14 +125,3 @@ IdempotencyKey = Annotated[
         description="Any text, new for every new request: the same request sent again with it is done once (for a day)",
     ),
 ]
-SettingsDep = Annotated[Settings, Depends(get_settings)]
-CamerasDep = Annotated[Cameras, Depends(get_cameras)]
-ModelDep = Annotated[ModelFolder, Depends(get_model)]
-EstimatorDep = Annotated[Estimator, Depends(get_estimator)]
-SharerDep = Annotated[str | None, Depends(get_sharer)]
-WorkerDep = Annotated[Worker, Depends(get_worker)]
-CalibrationsDep = Annotated[Calibrations, Depends(get_calibrations)]
-SpoolDep = Annotated[Spool, Depends(get_spool)]
-RunnerDep = Annotated[Runner, Depends(get_runner)]
-OwnerDep = Annotated[str, Depends(get_owner)]
-FollowersDep = Annotated[Followers, Depends(get_followers)]
