@@ -13,7 +13,7 @@ from service.inference.hypotheses import SIGMA_OF_LAPLACE, in_metres, merged
 from service.inference.pair import RawMaps, Side
 from service.inference.part import Part
 from service.inference.resampling import Lines, Ratio, bands, sample, shrunk_size
-from service.opencv import exp
+from service.opencv import exp, where
 from service.optics import thin_lens
 from service.optics.camera import Camera
 
@@ -70,20 +70,20 @@ class Reading:
             blur_error = SIGMA_OF_LAPLACE * np.clip(exp(maps["blur_log_error"][rows]), *BLUR_ERROR_RANGE)
             has_far = blur_px[rows] * exp(-2 * blur_error) < infinitely_far_px
             near_m = exp(depth_m[rows]) * focus_m
-            far_m = np.where(has_far, exp(other_m[rows]) * focus_m, near_m)
+            far_m = where(has_far, exp(other_m[rows]) * focus_m, near_m)
             if side != "far":
-                np.copyto(p_near[rows], 1, where=~has_far)
+                p_near[rows] = where(has_far, p_near[rows], 1)
             own = stated_error(error[rows], camera, manifest)
             answer_m, deviation, is_far = merged(near_m, far_m, p_near[rows], own)
-            by_blur = _by_blur(answer_m[is_far], blur_px[rows][is_far], blur_error[is_far], camera)
-            deviation[is_far] = np.maximum(deviation[is_far], by_blur)
+            by_blur = _by_blur(answer_m, blur_px[rows], blur_error, camera)
+            deviation = where(is_far, np.maximum(deviation, by_blur), deviation)
             least = least_error(answer_m, camera)
             is_known = (np.fmax(own, least) <= MAX_RELATIVE_ERROR) & (blur_px[rows] <= most_blur_px)
             is_known &= (nearest * focus_m <= answer_m) & (answer_m <= farthest * focus_m)
             is_known &= has_far | (side != "far")
             depth_m[rows] = answer_m
-            other_m[rows] = np.where(is_far, near_m, np.where(has_far, far_m, np.float32(np.nan)))
-            error[rows] = np.where(is_known, np.clip(deviation, least, MOST_STATED), NO_ANSWER)
+            other_m[rows] = where(is_far, near_m, where(has_far, far_m, np.nan))
+            error[rows] = where(is_known, np.minimum(np.maximum(deviation, least), MOST_STATED), NO_ANSWER)
         return cls(
             depth_m,
             other_m,

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from service.opencv import exp, log
+from service.opencv import exp, log, where
 
 SIGMA_OF_LAPLACE = np.float32(2**0.5)
 LEAST_P_NEAR = 0.35
@@ -40,20 +40,19 @@ def merged(near_m: Array, far_m: Array, p_near: Array, error: Array) -> tuple[Ar
     relatively; but no more than leaves far the likelier below ``LEAST_P_NEAR``: the network's probabilities are not
     that exact.
     """
-    ratio = far_m / near_m
+    ratio, p_far = far_m / near_m, 1 - p_near
     odds = p_near * np.minimum(ratio, (1 - LEAST_P_NEAR) / LEAST_P_NEAR)
-    lean = (odds - (1 - p_near)) / (odds + (1 - p_near))
-    doubt, side = 1 - lean**2, np.copysign(np.float32(1), lean)
-    half_gap = log(ratio) / 2
-    scale = error / SIGMA_OF_LAPLACE
+    lean = (odds - p_far) / (odds + p_far)
+    is_far = lean < 0
+    gap, scale = log(ratio), error / SIGMA_OF_LAPLACE
     # between the peaks the median solves a quadratic equation in exp(pull / scale)
     np.abs(lean, out=lean)
-    root = np.sqrt(lean**2 + doubt * exp(-2 * half_gap / scale))
+    square = np.square(lean)
+    root = np.sqrt(square + (1 - square) * exp(-gap / scale))
     pull = scale * log((1 + lean) / np.maximum(lean + root, np.finfo(np.float32).tiny))
-    probability = 0.5 + side * (p_near - 0.5)
-    deviation = np.sqrt(error**2 + probability * pull**2 + (1 - probability) * (2 * half_gap - pull) ** 2)
-    depth_m = near_m * exp(half_gap - side * (half_gap - pull))
-    return depth_m, deviation, side < 0
+    from_near = where(is_far, gap - pull, pull)
+    deviation = np.sqrt(error**2 + p_near * from_near**2 + p_far * (gap - from_near) ** 2)
+    return near_m * exp(from_near), deviation, is_far
 
 
 def in_metres(error: Array) -> Array:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from service.inference.depth_map import MAX_RELATIVE_ERROR, MOST_STATED, Reading, least_error
 from service.inference.resampling import bands, enlarged
-from service.opencv import cv2, exp, log
+from service.opencv import cv2, exp, log, where
 
 CELLS = 8  # of the maps, each way, whose mean is one in what surrounds them
 FEWER = 2  # cells each way that are drawn alike
@@ -40,13 +40,13 @@ def settle(reading: Reading, limits_m: tuple[float, float], stride: int, longer_
     variance = np.square(np.clip(error, LEAST_ERROR, MOST_ERROR))
     reach = max(1, round(min(REACH * longer_px, MOST_REACH_PX) / (stride * CELLS)))
     plane, unevenness = _surroundings(depth_m, np.reciprocal(variance), reach)
-    maps = depth_m, np.where(np.isfinite(other_m), other_m, depth_m), reading.p_near, variance
+    maps = depth_m, where(np.isfinite(other_m), other_m, depth_m), reading.p_near, variance
     own_m, other_m, p_near, variance = (_means(values, FEWER) for values in maps)
     plane, unevenness = (_enlarged(values, CELLS // FEWER, own_m.shape) for values in (plane, unevenness))
 
     off, gap = log(own_m * plane), log(other_m / own_m)
     spread = OWN_SPREAD**2 + UNEVEN_WEIGHT * unevenness
-    doubt = np.where(gap < 0, p_near, 1 - p_near)
+    doubt = where(gap < 0, p_near, 1 - p_near)
     read = np.maximum(variance - doubt * gap**2, LEAST_ERROR**2)
     likelier = np.clip((off**2 - (off + gap) ** 2) / (2 * (read + spread)), -MOST_LIKELIER, MOST_LIKELIER)
     odds = doubt * exp(likelier)
@@ -57,8 +57,8 @@ def settle(reading: Reading, limits_m: tuple[float, float], stride: int, longer_
     towards = _enlarged(towards, FEWER, depth_m.shape)
     for rows in bands(depth_m.shape):
         depth_m[rows] = np.clip(depth_m[rows] * exp(towards[rows]), *limits_m)
-        stated = np.clip(error[rows], least_error(depth_m[rows], reading.camera), MOST_STATED)
-        np.copyto(error[rows], stated, where=error[rows] <= MAX_RELATIVE_ERROR)
+        stated = np.minimum(np.maximum(error[rows], least_error(depth_m[rows], reading.camera)), MOST_STATED)
+        error[rows] = where(error[rows] <= MAX_RELATIVE_ERROR, stated, error[rows])
 
 
 def _surroundings(depth_m: Array, certainty: Array, reach: int) -> tuple[Array, Array]:
