@@ -110,5 +110,5 @@ def blend(maps: RawMaps, coarse: RawMaps, ratio: Ratio, strong_px: float, *, by_
 
 
 def _continued(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """A map one column wider."""
-    return np.asarray(cv2.copyMakeBorder(values, 0, 0, 0, 1, cv2.BORDER_REPLICATE), np.float32)
+    """A map one row and one column larger."""
+    return np.asarray(cv2.copyMakeBorder(values, 0, 1, 0, 1, cv2.BORDER_REPLICATE), np.float32)

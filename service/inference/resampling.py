@@ -1,5 +1,6 @@
 """Maps at every pixel of the photograph: bilinear, with pixel centres where the conventions put them."""
 
+import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple, Self
 
@@ -8,7 +9,7 @@ from numpy.typing import NDArray
 
 from service.opencv import cv2
 
-BAND_PX = 100_000
+WHOLE_PX, BAND_PX = 320_000, 100_000
 
 
 class Ratio(NamedTuple):
@@ -58,9 +59,9 @@ def shrunk_size(size: tuple[int, int], longest_px: int) -> tuple[int, int]:
 
 
 def bands(size: tuple[int, int]) -> Iterator[slice]:
-    """Rows of an image (height, width), few enough at a time to stay in the processor's cache."""
+    """Rows of an image (height, width), few enough at a time to stay in the processor's cache; all of a small one's."""
     height, width = size
-    rows = max(1, BAND_PX // width)
+    rows = height if height * width <= WHOLE_PX else max(1, BAND_PX // width)
     return (slice(top, min(top + rows, height)) for top in range(0, height, rows))
 
 
@@ -73,6 +74,10 @@ def sample(
     values: NDArray[np.float32], ratio: Ratio, rows: slice | NDArray[np.intp], width: int
 ) -> NDArray[np.float32]:
     """The map [h, w] at some rows of a photograph so many pixels wide; its edges are continued."""
+    if isinstance(rows, slice) and rows.start == 0:  # both ways at once takes a third of the time
+        values = values[: math.ceil(rows.stop * ratio.rows) + 1]
+        large = cv2.resize(values, None, fx=1 / ratio.columns, fy=1 / ratio.rows, interpolation=cv2.INTER_LINEAR)
+        return np.asarray(large, np.float32)[: rows.stop, :width]
     at = (np.r_[rows] + 0.5) * ratio.rows - 0.5
     above = np.floor(at).astype(np.intp)
     upper, lower = (values.take(above + i, axis=0, mode="clip") for i in (0, 1))
