@@ -12,7 +12,7 @@ from service.inference.artifact import BLUR_ERROR_RANGE, Manifest
 from service.inference.hypotheses import SIGMA_OF_LAPLACE, in_metres, merged
 from service.inference.pair import RawMaps, Side
 from service.inference.part import Part
-from service.inference.resampling import Lines, Ratio, bands, sample, shrunk_size
+from service.inference.resampling import WHOLE_PX, Lines, Ratio, bands, sample, shrunk_size
 from service.opencv import exp, where
 from service.optics import thin_lens
 from service.optics.camera import Camera
@@ -248,7 +248,7 @@ def fraction(where: NDArray[np.bool_]) -> float:
 def decide(reading: Reading, size: tuple[int, int]) -> tuple[Array, NDArray[np.bool_]]:
     """Depth (height, width) and which pixels have an answer."""
     depth_m, valid = np.empty(size, np.float32), np.empty(size, np.bool_)
-    for rows in bands(size):
+    for rows in bands(size, WHOLE_PX):
         depth_m[rows], error = _sampled(reading, rows, size[1], "depth_m", "error")
         valid[rows] = error <= MAX_RELATIVE_ERROR
     depth_m[~valid] = np.nan

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from service.opencv import cv2
 
-WHOLE_PX, BAND_PX = 320_000, 100_000
+BAND_PX = 100_000
+WHOLE_PX = 320_000  # of a picture that maps are brought to at once, where little else is done
 
 
 class Ratio(NamedTuple):
@@ -58,10 +59,10 @@ def shrunk_size(size: tuple[int, int], longest_px: int) -> tuple[int, int]:
     return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
 
 
-def bands(size: tuple[int, int]) -> Iterator[slice]:
-    """Rows of an image (height, width), few enough at a time to stay in the processor's cache; all of a small one's."""
+def bands(size: tuple[int, int], whole_px: int = BAND_PX) -> Iterator[slice]:
+    """Rows of an image (height, width), few enough at a time for the processor's cache; all of one of ``whole_px``."""
     height, width = size
-    rows = height if height * width <= WHOLE_PX else max(1, BAND_PX // width)
+    rows = height if height * width <= whole_px else max(1, BAND_PX // width)
     return (slice(top, min(top + rows, height)) for top in range(0, height, rows))
 
 
