@@ -26,5 +26,5 @@ def where(
     """``np.where`` of maps: in a quarter of the time where the mask is smooth, and in a twentieth where it is noise."""
     chosen = np.empty(mask.shape, np.float32)
     chosen[...] = others
-    cv2.copyTo(values, mask, chosen)
+    cv2.copyTo(values, mask.view(np.uint8), chosen)
     return chosen

@@ -1,7 +1,6 @@
 """16-bit grey PNG (ISO/IEC 15948), deflated by ISA-L: a fourth of the time that OpenCV's zlib takes, and no larger."""
 
 import struct
-import zlib
 
 import numpy as np
 from isal import isal_zlib
@@ -29,4 +28,5 @@ def grey_png(levels: NDArray[np.uint16], description: str = "") -> bytes:
 
 
 def _chunk(kind: bytes, content: bytes) -> bytes:
-    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(content, zlib.crc32(kind)))
+    checksum = isal_zlib.crc32(content, isal_zlib.crc32(kind))
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", checksum)
