@@ -15,7 +15,7 @@ from service.inference.frame import (
     camera_of,
     maybe_another_part,
     maybe_of_another_size,
-    maybe_seen_narrower,
+    maybe_seen_otherwise,
     maybe_wrong_specs,
     taken_otherwise,
 )
@@ -82,8 +82,8 @@ def fulfil(cancellation: Cancellation, order: Order, estimator: Estimator) -> An
     registered = order.record.camera
     specs = (*maybe_of_another_size(registered), *maybe_wrong_specs(order.record.draft.lens, registered))
     shown = maybe_another_part(photograph.exif, camera)
-    has_points = not PROJECTED.isdisjoint(order.formats) and registered.intrinsics is None
-    seen = maybe_seen_narrower(camera) if has_points else ()
+    known_at_m = registered.focus_distance_m if registered.intrinsics else None
+    seen = () if PROJECTED.isdisjoint(order.formats) else maybe_seen_otherwise(camera, known_at_m)
     for point in known:
         pixel_at(point.u, point.v, whole, "known")
     depth_map = estimator.estimate(photograph.rgb, camera, order.query.side, cancellation, order.query.part, known)

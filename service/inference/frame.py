@@ -179,13 +179,21 @@ def maybe_another_part(exif: Exif, camera: Camera) -> Iterator[str]:
         )
 
 
-def maybe_seen_narrower(camera: Camera) -> Iterator[str]:
-    """A warning for what ``fx_px`` measures, where it follows from lens specs and the lens is focused close."""
+def maybe_seen_otherwise(camera: Camera, known_at_m: float | None) -> Iterator[str]:
+    """A warning for what ``fx_px`` measures, where the lens is focused much nearer or farther than where it is known.
+
+    ``known_at_m`` is the focus that intrinsics were given for; None where lens specs tell them, of infinity.
+    """
     if camera.focal_length_m is None:
         return
     longer = thin_lens.image_distance_in_focal_lengths(camera.focus_distance_m, camera.focal_length_m)
-    if longer > VIEW_TOLERANCE:
+    where = "far away"
+    if known_at_m is not None:
+        longer /= thin_lens.image_distance_in_focal_lengths(known_at_m, camera.focal_length_m)
+        where = f"at {known_at_m:.4g} m"
+    if not 1 / VIEW_TOLERANCE <= longer <= VIEW_TOLERANCE:
+        moved = "nearer to" if longer > 1 else "farther from"
         yield (
-            "fx_px is that of the lens focused far away: in one that moves as a whole it is "
-            f"{longer:.3g} times that, and points lie as much nearer to the axis: calibrate, or give intrinsics"
+            f"fx_px is that of the lens focused {where}: in one that moves as a whole it is {longer:.3g} times that, "
+            f"and points lie as much {moved} the axis: calibrate, or give intrinsics, for this focus"
         )

@@ -14,7 +14,7 @@ from service.inference.frame import (
     camera_of,
     maybe_another_part,
     maybe_of_another_size,
-    maybe_seen_narrower,
+    maybe_seen_otherwise,
     maybe_wrong_specs,
     taken_otherwise,
 )
@@ -213,14 +213,22 @@ def test_a_macro_lens_may_be_as_much_nearer_than_its_sensor_as_it_is_long(
 
 
 @pytest.mark.parametrize(
-    ("focus_distance_m", "focal_length_m", "words"),
-    [(0.2, 0.05, "1.33 times"), (0.06, 0.025, "1.71 times"), (2.0, 0.05, ""), (0.2, None, "")],
+    ("focus_distance_m", "focal_length_m", "known_at_m", "words"),
+    [
+        (0.2, 0.05, None, "1.33 times"),
+        (0.06, 0.025, None, "1.71 times"),
+        (2.0, 0.05, None, ""),
+        (0.2, None, None, ""),
+        (0.2, 0.05, 0.2, ""),
+        (0.2, 0.05, 2.0, "at 2 m: in one that moves as a whole it is 1.3 times that, and points lie as much near"),
+        (2.0, 0.05, 0.2, "at 0.2 m: in one that moves as a whole it is 0.769 times that, and points lie as much far"),
+    ],
 )
-def test_a_focal_length_that_close_focus_makes_longer_is_told_of(
-    focus_distance_m: float, focal_length_m: float | None, words: str
+def test_a_focal_length_that_focus_elsewhere_changes_is_told_of(
+    focus_distance_m: float, focal_length_m: float | None, known_at_m: float | None, words: str
 ) -> None:
     camera = Camera(640, 480, focus_distance_m, 40.0, focal_length_m=focal_length_m)
-    said = [*maybe_seen_narrower(camera)]
+    said = [*maybe_seen_otherwise(camera, known_at_m)]
     assert len(said) == bool(words)
     assert all(words in warning for warning in said)
 
