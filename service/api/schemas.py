@@ -77,7 +77,11 @@ class PinholeIntrinsics(Given):
     cx_px: Finite
     cy_px: Finite
     distortion: Annotated[
-        list[Finite], Field(max_length=14, description="OpenCV's order: 0, 4, 5, 8, 12 or 14 coefficients")
+        list[Finite],
+        Field(
+            max_length=14,
+            description="OpenCV's order: 0, 4, 5, 8, 12 or 14 coefficients, never its fisheye model's (equidistant)",
+        ),
     ] = []
 
     def to_domain(self) -> Intrinsics:

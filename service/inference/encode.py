@@ -17,7 +17,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from service.errors import BadRequest
-from service.inference.depth_map import DepthMap
+from service.inference.depth_map import DepthMap, fraction
 from service.inference.part import Part
 from service.inference.png import grey_png
 from service.inference.preview import render_preview
@@ -190,11 +190,10 @@ def encode_ply(answer: DepthMap, beside: Beside) -> Encoded:
     points["z"] = z
     shown = Lines.spread((beside.rgb.shape[0], beside.rgb.shape[1]), (answer.height_px, answer.width_px))
     points["red"], points["green"], points["blue"] = beside.rgb[shown.rows[v], shown.columns[u]].T
-    lost = (
-        f"{1 - is_met.mean():.1%} of the points are left out: by the camera's distortion no ray meets the sensor there"
-    )
     body = _ply_header(len(z), beside) + points.tobytes()
-    return Encoded(body, MEDIA_TYPES["ply"], warnings=() if is_met.all() else (lost,))
+    why = "by the camera's distortion no ray meets the sensor there"
+    lost = () if is_met.all() else (f"{fraction(~is_met):.1%} of the points are left out: {why}",)
+    return Encoded(body, MEDIA_TYPES["ply"], warnings=lost)
 
 
 def encode_preview(answer: DepthMap, _: Beside) -> Encoded:

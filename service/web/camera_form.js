@@ -194,7 +194,7 @@ export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 					${fields.by === "lens" && field("lens/k_r", "k_r", { hint: "circle of confusion over its deviation; a disc has 4" })}
 					${field("intrinsics/fx_px", "fx (px)")} ${field("intrinsics/fy_px", "fy (px)")}
 					${field("intrinsics/cx_px", "cx (px)")} ${field("intrinsics/cy_px", "cy (px)")}
-					${field("intrinsics/distortion", "Distortion", { kind: "text", hint: "0, 4, 5, 8, 12 or 14 numbers in OpenCV's order" })}
+					${field("intrinsics/distortion", "Distortion", { kind: "text", hint: "0, 4, 5, 8, 12 or 14 numbers in OpenCV's order, not its fisheye's" })}
 					${field("description", "Description", { kind: "text" })}
 				</div>
 			</details>

@@ -151,6 +151,13 @@ def test_unknown_intrinsics_are_nan_in_npz_and_no_point_cloud(answer: DepthMap) 
         encode_ply(blind, BESIDE)
 
 
+def test_nothing_seen_is_a_cloud_without_points(answer: DepthMap) -> None:
+    blank = replace(answer, valid=np.zeros_like(answer.valid))
+    cloud = encode_ply(blank, BESIDE)
+    assert b"element vertex 0\n" in cloud.body
+    assert not cloud.warnings
+
+
 def test_ply_points_project_back_to_their_pixels(answer: DepthMap) -> None:
     head, _, body = encode_ply(answer, BESIDE).body.partition(b"end_header\n")
     assert b"element vertex 1199\n" in head
