@@ -253,8 +253,8 @@ def _rays(answer: DepthMap, u: NDArray[np.intp], v: NDArray[np.intp]) -> NDArray
     middles = (corners[:, :-1, :-1] + corners[:, :-1, 1:] + corners[:, 1:, :-1] + corners[:, 1:, 1:]) / 4
     off = _grid_rays(answer, down[:-1] + RAY_CELL_PX / 2, across[:-1] + RAY_CELL_PX / 2) - middles
     is_bent = ~(np.hypot(*off) * matrix[0, 0] <= MOST_BENT_PX)
-    if is_bent.any():
-        alone = is_bent[v // RAY_CELL_PX, u // RAY_CELL_PX]
+    alone = is_bent[v // RAY_CELL_PX, u // RAY_CELL_PX]
+    if alone.any():
         rays[:, alone] = _undistorted(answer, u[alone], v[alone])
     return rays
 

@@ -265,6 +265,10 @@ def test_all_that_a_wide_lens_sees_is_a_point(answer: DepthMap) -> None:
     told = encode_ply(wide, BESIDE)
     assert told.warnings == ()
     assert f"element vertex {np.count_nonzero(answer.valid)}\n".encode() in told.body
+    in_the_middle = np.zeros_like(answer.valid)
+    in_the_middle[13:17, 18:22] = True
+    # where nothing is answered in the corners, in which alone it bends much
+    assert b"element vertex 16\n" in encode_ply(replace(wide, valid=in_the_middle), BESIDE).body
 
 
 def test_preview_is_near_red_far_blue_and_grey_without_an_answer(answer: DepthMap) -> None:
