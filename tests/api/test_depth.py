@@ -301,8 +301,8 @@ def test_what_focus_that_near_does_to_a_focal_length_from_specs_is_said_of_point
     for name, kind, is_warned in (("d200", "npz", True), ("d200", "png", False), ("given", "npz", False)):
         warned = ask(client, png(grey(60, 432, 645)), camera=name, format=kind).headers["Camind-Warnings"]
         assert ("fx_px is that of the lens focused far away" in warned) == is_warned, (name, kind)
-    warned = ask(client, png(grey(60, 432, 645)), camera="given", format="npz", focus_distance_m=1).headers
-    assert "fx_px is that of the lens focused at 0.25 m" in warned["Camind-Warnings"]
+    elsewhere = ask(client, png(grey(60, 432, 645)), camera="given", format="npz", focus_distance_m=1)
+    assert "fx_px is that of the lens focused at 0.25 m" in elsewhere.headers["Camind-Warnings"]
 
 
 def test_a_photograph_by_another_lens_is_warned_of(client: TestClient, d200: dict[str, Any]) -> None:
