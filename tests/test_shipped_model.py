@@ -159,6 +159,17 @@ def test_tiles_show_no_seams(side: Side) -> None:
     assert 0 < np.nanquantile(change, 0.9 if side == "auto" else 0.98) < 0.01
 
 
+def test_a_scene_is_read_as_the_same_one_larger_where_focus_is_nearer_than_the_model_knows(
+    estimator: Estimator,
+) -> None:
+    """What focus distances say of sides goes on to mislead below those that were trained on."""
+    picture = np.asarray(cv2.imdecode(np.frombuffer(PICTURE.read_bytes(), np.uint8), cv2.IMREAD_COLOR_RGB), np.uint8)
+    part = picture[100:292, 200:456]
+    nearest_m = estimator.manifest.ranges.focus_distance_m.low
+    close, known = (estimator.estimate(part, Camera(256, 192, s, 8.0)).depth_m / s for s in (0.03, nearest_m))
+    np.testing.assert_allclose(close, known, rtol=1e-5)
+
+
 @pytest.mark.parametrize("seed", [0, 3, 4, 6])
 def test_textured_planes_stand_in_their_order_and_about_where_they_stand(
     estimator: Estimator, seed: int, monkeypatch: pytest.MonkeyPatch

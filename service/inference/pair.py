@@ -106,7 +106,7 @@ class GraphPair:
         with stopwatch.stage("blur"):
             seen = sights.of(rgb, lambda: self.see(rgb, cancellation)) if sights else self.see(rgb, cancellation)
         with stopwatch.stage("correct"):
-            feeds = _corrected(seen, camera, side)
+            feeds = _corrected(seen, camera, side, self._nearest_focus_m)
         with stopwatch.stage("depth"):
             told = self._depth.run(feeds, cancellation)
         rows, columns = (-(-size // self.manifest.stride) for size in rgb.shape[:2])
@@ -133,7 +133,11 @@ class GraphPair:
         tiny = np.zeros((self.manifest.multiple, self.manifest.multiple, 3), np.uint8)
         seen = self._blur.run({"image": self._padded(tiny)}, Cancellation(), free_memory=True)
         camera = Camera(tiny.shape[1], tiny.shape[0], 1.0, 1.0)
-        self._depth.run(_corrected(seen, camera, "auto"), Cancellation(), free_memory=True)
+        self._depth.run(_corrected(seen, camera, "auto", self._nearest_focus_m), Cancellation(), free_memory=True)
+
+    @property
+    def _nearest_focus_m(self) -> float:
+        return self.manifest.ranges.focus_distance_m.low
 
     def see(self, rgb: NDArray[np.uint8], cancellation: Cancellation) -> RawMaps:
         """What the blur graph says of an image: the same for every camera."""
@@ -150,8 +154,12 @@ class GraphPair:
         return image
 
 
-def _corrected(seen: RawMaps, camera: Camera, side: Side) -> RawMaps:
-    """What the depth graph is given: blur with the camera taken out (eq. 6 and 7), and the camera itself."""
+def _corrected(seen: RawMaps, camera: Camera, side: Side, nearest_focus_m: float) -> RawMaps:
+    """What the depth graph is given: blur with the camera taken out (eq. 6 and 7), and the camera itself.
+
+    It answers ratios to the focus distance, which are those of the same scene larger, farther away and as blurred: of a
+    focus nearer than it knows it is told the nearest that it does.
+    """
     blur_px = seen["blur_px"]
     gamma_px, k_cam_px = camera.gamma_px, camera.k_cam_px
     defocus, spread = np.empty_like(blur_px), np.empty_like(blur_px)
@@ -165,7 +173,7 @@ def _corrected(seen: RawMaps, camera: Camera, side: Side) -> RawMaps:
         **{name: value for name, value in seen.items() if name not in ("blur_px", "blur_log_error")},
         "relative_defocus": defocus,
         "relative_defocus_spread": spread,
-        "focus_distance_m": np.array([camera.focus_distance_m], np.float32),
+        "focus_distance_m": np.array([max(camera.focus_distance_m, nearest_focus_m)], np.float32),
         "focal_length_px": np.array([focal_length_px], np.float32),
         "side": np.array([SIDE_HINTS[side]], np.float32),
     }
