@@ -9,7 +9,7 @@ from service.optics import thin_lens
 from service.optics.camera import Camera
 
 # standard deviations of a logarithm: of the focus distance that was told, as by a ring, of the gamma that was told, as
-# no specs do, the least of a blur read, and of where focus lies between what was said to be nearer and beyond
+# no specs do, the least of a blur read, and the most of where focus lies between what was said to be nearer and beyond
 TOLD_ERROR = 0.1
 TOLD_GAMMA_ERROR = 0.3
 READING_ERROR = 0.1
@@ -141,7 +141,10 @@ def _candidates(
     k_cam_px = camera.focused_at(focus_m).k_cam_px
     seen = [(each.deviation, thin_lens.defocus_at_depth(each.depth_m, focus_m, k_cam_px)) for each in sightings]
     off_focus = math.log(focus_m / camera.focus_distance_m) / TOLD_ERROR
-    lost = _loss(off_focus) + sum(_loss(_off_side(each.depth_m, focus_m, is_near)) for each in sightings)
+    # what is clearly blurred is seen to be out of focus, however little that is of a large k_cam
+    side_error = min(SIDE_ERROR, max(camera.gamma_px, LEAST_BLUR_PX) / k_cam_px)
+    off_side = (_off_side(each.depth_m, focus_m, is_near) / side_error for each in sightings)
+    lost = _loss(off_focus) + sum(map(_loss, off_side))
     for ratio in GAMMA_RATIOS:
         gamma_px, off_gamma = camera.gamma_px * ratio, math.log(ratio) / TOLD_GAMMA_ERROR
         loss = lost + off_gamma**2 / 2
@@ -154,8 +157,8 @@ def _candidates(
 
 
 def _off_side(depth_m: float, focus_m: float, is_near: bool | None) -> float:
-    """By how many standard deviations a thing is on the side of focus where nothing was said to be."""
-    beyond = math.log(depth_m / focus_m) / SIDE_ERROR
+    """How far, as a logarithm, a thing is on the side of focus where nothing was said to be."""
+    beyond = math.log(depth_m / focus_m)
     return 0.0 if is_near is None else max(0.0, beyond if is_near else -beyond)
 
 

@@ -78,6 +78,14 @@ def test_of_one_thing_close_to_focus_that_side_is_taken_on_which_all_was_said_to
     assert (fit.focus_distance_m > depth_m) == is_near != (without.focus_distance_m > depth_m)
 
 
+def test_of_a_large_k_cam_what_is_clearly_blurred_is_on_its_side_however_near_focus_it_is() -> None:
+    told = Camera(640, 480, 0.095, 80.0, 0.5)
+    seen = [Sighting(0.0985, told.focused_at(0.1).blur_px(0.0985), EXACT)]
+    near, without = fit_focus(told, seen, is_near=True), fit_focus(told, seen)
+    assert near.focus_distance_m == pytest.approx(0.1, rel=0.002)
+    assert without.focus_distance_m < 0.0985
+
+
 def test_a_doubtful_reading_moves_it_less() -> None:
     sure, doubtful = (fitted(1.6, 1.2, error=error).focus_distance_m for error in (0.1, 0.8))
     assert 1.6 < sure < doubtful < 2.0
