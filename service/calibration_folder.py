@@ -13,6 +13,7 @@ from service.calibration.report import PictureReport, Report, Role
 from service.errors import InvalidImage
 from service.file_names import name_column, shown
 from service.inference.images import SUFFIXES, ImageLimits, photographs_in, read_stored_frame
+from service.optics.metres import in_words
 
 REPORT = TypeAdapter(Report)
 
@@ -74,9 +75,12 @@ def write(report: Report, out: Path) -> None:
 def _table(report: Report) -> Table:
     table = Table(name_column(), "circles", "blur px", "distance m", "tilt deg", "", box=None, pad_edge=False)
     for picture in report.pictures:
-        figures = ((picture.blur_px, ".2f"), (picture.distance_m, ".3f"), (picture.tilt_deg, ".0f"))
-        numbers = ["" if value is None else format(value, form) for value, form in figures]
-        table.add_row(picture.name, str(picture.circles), *numbers, "; ".join(picture.warnings))
+        distance = "" if picture.distance_m is None else in_words(picture.distance_m)
+        blur, tilt = (
+            "" if value is None else format(value, form)
+            for value, form in ((picture.blur_px, ".2f"), (picture.tilt_deg, ".0f"))
+        )
+        table.add_row(picture.name, str(picture.circles), blur, distance, tilt, "; ".join(picture.warnings))
     return table
 
 

@@ -22,6 +22,7 @@ from service.inference.cancellation import Cancellation
 from service.inference.estimator import Estimator
 from service.inference.images import SUFFIXES, ImageLimits, photographs_in
 from service.memory import keep_freed_memory
+from service.optics.metres import in_words
 from service.storage.cameras import CameraRecord
 
 ENDINGS = {"preview": ".jpg"}  # of the others it is their name
@@ -167,13 +168,14 @@ def _print(made: Sequence[tuple[Path, Made]]) -> None:
         numbers = _metres(spread.median), f"{_metres(spread.p5)} to {_metres(spread.p95)}"
         depths.add_row(shown(path.name), *numbers, f"{one.read.valid_fraction:.0%}", f"{one.focus_m:.4g}", one.remarks)
         for at in one.read.points:
-            found = map(_metres, (at.depth_m, at.sigma_m, at.depth_alt_m))
-            points.add_row(shown(path.name), f"{at.u:g}", f"{at.v:g}", *found)
+            found = (at.depth_m, at.sigma_m, at.depth_alt_m)
+            told = (_metres(value, at.depth_m) for value in found)
+            points.add_row(shown(path.name), f"{at.u:g}", f"{at.v:g}", *told)
     console = Console(markup=False, emoji=False)  # a file's name is no markup
     for table in (depths, points):
         if table.row_count:
             console.print(table)
 
 
-def _metres(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
+def _metres(value: float | None, like: float | None = None) -> str:
+    return "-" if value is None else in_words(value, like)

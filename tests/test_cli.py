@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import socket
 import sqlite3
 import subprocess
@@ -383,8 +384,9 @@ def test_a_folder_of_photographs_becomes_depth(bench: Path, tiny_model_dir: Path
     (photos / "broken.jpg").unlink()
     (out / "half [b].npy").unlink()
     kept = (out / "whole.npy").stat().st_mtime_ns
-    again = at_once(*asked, "--only-missing")
+    again = at_once(*asked, "--only-missing", "--focus-distance-m", "0.1")
     assert again.exit_code == 0, again.stderr
+    assert re.search(r"0\.09\d\d\d +0\.09\d\d\d to", again.stdout)  # what is close has four digits
     assert "has depth of 1 of 1 photographs, and had that of 1" in again.stdout
     assert (out / "half [b].npy").exists()
     assert (out / "whole.npy").stat().st_mtime_ns == kept

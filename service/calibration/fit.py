@@ -17,6 +17,7 @@ from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
 from service.optics import thin_lens
+from service.optics.metres import in_words
 
 Array = NDArray[np.float64]
 
@@ -42,7 +43,8 @@ UNCHECKED = (
 )
 CURVE_POINTS, CURVE_BEYOND = 60, 1.05
 FENCE = 1.5  # quartile ranges beyond the quartiles: outliers as a box plot has them
-LEAST_EXCESS = 0.05
+# from where on a circle tells k_cam alone: so far from focus, or by a large k_cam so clearly blurred (in gamma)
+LEAST_EXCESS, CLEARLY_BLURRED = 0.05, 3.0
 MISFIT = 0.1
 MUST_SHOW = 0.5  # of gamma, that the largest defocus must reach
 GAMMA_BOUNDS_PX = (0.02, 20.0)
@@ -175,8 +177,8 @@ def _doubt(circles: Circles, given_m: float, fit: Fit, depth_error: float) -> tu
     if own.low / OFF <= given_m <= own.high * OFF:
         return None
     told = (
-        f"the photographs say {own.value:.3f} m ({own.low:.3f} to {own.high:.3f}), not the {given_m:g} m given: check "
-        "focus_distance_m, or leave it out, and the sheet's spacing"
+        f"the photographs say {in_words(own.value)} m ({in_words(own.low)} to {in_words(own.high)}), not the "
+        f"{given_m:g} m given: check focus_distance_m, or leave it out, and the sheet's spacing"
     )
     if is_sure and not 1 / FAR_OFF < given_m / own.value < FAR_OFF:
         raise FitError(told)
@@ -223,8 +225,8 @@ def per_circle_k_cam(circles: Circles, gamma_px: float, focus_m: float) -> Array
     """What each circle alone says of k_cam [n]; NaN where it is focused, or too near the plane in focus."""
     excess = circles.excess(focus_m)
     sigma = thin_lens.defocus_from_blur(circles.blur_px, gamma_px)
-    says = (excess > LEAST_EXCESS) & (sigma > 0)
-    return np.where(says, sigma / np.maximum(excess, LEAST_EXCESS), np.nan)
+    says = (excess > 0) & (sigma > 0) & ((excess > LEAST_EXCESS) | (sigma > CLEARLY_BLURRED * gamma_px))
+    return np.divide(sigma, excess, out=np.full_like(sigma, np.nan), where=says)
 
 
 def _constants(circles: Circles, fit: Fit, focus_m: float | None, depth_error: float, resamples: int) -> Constants:

@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from service.calibration.report import Result
+from service.optics.metres import in_words
 
 INCHES = (13.0, 4.6)
 BLUE, ORANGE, GREY = "#1f5fa8", "#d9730d", "#8a8a8a"
@@ -51,7 +52,7 @@ def _blur(axes: Axes, result: Result) -> None:
     k_cam, gamma, focus = result.k_cam_px, result.gamma_px, result.focus_distance_m
     axes.set_title(
         f"k_cam {k_cam.value:.3g} px [{k_cam.low:.3g}, {k_cam.high:.3g}], gamma {gamma.value:.2f} px, "
-        f"focus {focus.value:.3f} m",
+        f"focus {in_words(focus.value)} m",
         fontsize=9,
     )
     axes.legend(fontsize=8)

@@ -92,7 +92,7 @@ class Clues:
         defocus = [thin_lens.signed_defocus(point.depth_m, fit.focus_distance_m) for point in known]
         leanings = tuple(max(-1.0, min(1.0, -x / SURELY_OUT)) for x in defocus)
         told = [
-            f"focused at {fit.focus_distance_m:.3g} m ({fit.low_m:.3g} to {fit.high_m:.3g}), where "
+            f"focused at {fit.focus_distance_m:.4g} m ({fit.low_m:.4g} to {fit.high_m:.4g}), where "
             f"{camera.focus_distance_m:.4g} m was told, by what is known of the depth"
         ]
         if fit.gamma_ratio != 1:
@@ -167,7 +167,7 @@ class Clues:
             known = np.sqrt((1 - share[rows]) * error[rows] ** 2 + share[rows] * own_error[rows])
             np.copyto(error[rows], np.minimum(known, MOST_STATED), where=error[rows] <= MAX_RELATIVE_ERROR)
         return [
-            f"{depth_m[cell]:.3g} m is answered at {point.u:g},{point.v:g} for the known depth of {point.depth_m:g} m"
+            f"{depth_m[cell]:.4g} m is answered at {point.u:g},{point.v:g} for the known depth of {point.depth_m:g} m"
             for point, cell, by in zip(self.known, cells, still_off, strict=True)
             if abs(by) > MUCH_OFF and error[cell] <= MAX_RELATIVE_ERROR
         ]

@@ -13,6 +13,7 @@ const BOTTOM = 46;
 const LINE = 16; // so that two words never run into each other
 const LETTER = 7; // as wide as one may be
 const MOST_ROWS = 30;
+const TICK_DIGITS = 6; // they are round, and of a narrow range differ in the last ones alone
 
 /** @typedef {{x: number, y: number, low?: number, high?: number, label?: string}} Point */
 
@@ -48,13 +49,13 @@ export function Chart({ title, x, y, series, marks = [] }) {
 				${up.ticks.map(
 					(tick) => html`<g key=${tick}>
 						<line class="grid" x1=${LEFT} x2=${width - RIGHT} y1=${up.scale(tick)} y2=${up.scale(tick)} />
-						<text x=${LEFT - 6} y=${up.scale(tick) + 4} text-anchor="end">${short(tick)}</text>
+						<text x=${LEFT - 6} y=${up.scale(tick) + 4} text-anchor="end">${short(tick, TICK_DIGITS)}</text>
 					</g>`,
 				)}
 				${across.ticks.map(
 					(tick) => html`<g key=${tick}>
 						<line class="tick" x1=${across.scale(tick)} x2=${across.scale(tick)} y1=${HEIGHT - BOTTOM} y2=${HEIGHT - BOTTOM + 5} />
-						<text x=${across.scale(tick)} y=${HEIGHT - BOTTOM + 19} text-anchor="middle">${short(tick)}</text>
+						<text x=${across.scale(tick)} y=${HEIGHT - BOTTOM + 19} text-anchor="middle">${short(tick, TICK_DIGITS)}</text>
 					</g>`,
 				)}
 				<line class="axis" x1=${LEFT} x2=${width - RIGHT} y1=${HEIGHT - BOTTOM} y2=${HEIGHT - BOTTOM} />
@@ -128,7 +129,7 @@ function tabled({ name, kind, points }, x, y) {
 		<tbody>
 			${rows.map((point) => {
 				const numbers = isBand ? [point.x, point.low, point.high] : [point.x, point.y];
-				return html`<tr>${numbers.map((number) => html`<td class="number">${short(number)}</td>`)}</tr>`;
+				return html`<tr>${numbers.map((number) => html`<td class="number">${short(number, 4)}</td>`)}</tr>`;
 			})}
 		</tbody>
 	</table>`;

@@ -56,7 +56,7 @@ function Images({ images }) {
 					<td><span class=${`badge ${one.found ? "good" : "bad"}`}>${one.found ? "found" : "not found"}</span></td>
 					<td class="number">${one.circles}</td>
 					<td class="number">${measure(one.blur_px, " px")}</td>
-					<td class="number">${measure(one.distance_m, " m")}</td>
+					<td class="number">${measure(one.distance_m, " m", 4)}</td>
 					<td class="number">${measure(one.tilt_deg, "°", 2)}</td>
 					<td class="hint">${one.warnings.join("; ")}</td>
 				</tr>`,
@@ -209,7 +209,7 @@ function Outliers({ outliers }) {
 					<th scope="row" class="file">${one.image}</th>
 					<td class="number">${one.circle}</td>
 					<td class="number">${Math.round(one.u_px)}, ${Math.round(one.v_px)}</td>
-					<td class="number">${short(one.depth_m)}</td>
+					<td class="number">${short(one.depth_m, 4)}</td>
 					<td class="number">${short(one.blur_px)}</td>
 				</tr>`,
 			)}

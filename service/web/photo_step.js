@@ -199,7 +199,7 @@ function PhotoCard({ photo, isLooking, hasPartner: partner, onRole, onAgain, onR
 			${look?.found &&
 			html`<dl class="facts">
 				<dt>Blur</dt><dd>${measure(look.blur_px, " px")}</dd>
-				<dt>Distance</dt><dd>${measure(look.distance_m, " m")}</dd>
+				<dt>Distance</dt><dd>${measure(look.distance_m, " m", 4)}</dd>
 				<dt>Tilt</dt><dd>${measure(look.tilt_deg, "°", 2)}</dd>
 				<dt>Exposure</dt>
 				<dd class=${look.exposure === "good" ? "" : "fault"}>${EXPOSURES[/** @type {keyof typeof EXPOSURES} */ (look.exposure)]}</dd>

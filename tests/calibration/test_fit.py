@@ -196,6 +196,22 @@ def test_a_circle_tells_k_cam_alone_unless_it_is_in_focus_or_nearly() -> None:
     assert 0 < is_out.sum() < is_out.size
 
 
+def test_by_a_large_k_cam_circles_tell_it_that_are_clearly_blurred_however_near_focus() -> None:
+    depth_m = np.linspace(0.095, 0.105, 21)
+    blur = np.asarray(thin_lens.blur_at_depth(depth_m, 0.1, 300.0, GAMMA))
+    nowhere = np.zeros(depth_m.size, np.bool_)
+    alone = per_circle_k_cam(Circles(depth_m, blur, np.full(21, 0.02), np.arange(21), nowhere), GAMMA, 0.1)
+    is_clear = np.abs(depth_m - 0.1) > 0.0008
+    np.testing.assert_allclose(alone[is_clear], 300.0, rtol=1e-6)
+    assert np.isnan(alone[~is_clear]).all()
+
+
+def test_close_by_a_focus_distance_is_contradicted_to_more_than_millimetres() -> None:
+    some = circles(BOTH_SIDES, error=0.0).scaled(depth=0.05, blur=1.0)
+    with pytest.raises(FitError, match=r"say 0\.0(6000|5999) m \(0\.0[56]\d\d\d to 0\.06\d\d\d\), not the 0.066 m"):
+        fit_constants(some, 0.066, resamples=0)
+
+
 @pytest.mark.parametrize("times", [0.6, 1.6])
 def test_the_papers_k_cam_is_what_most_circles_tell(times: float) -> None:
     some = circles((*BOTH_SIDES, 0.5))

@@ -90,7 +90,7 @@ def test_the_interval_told_takes_the_error_of_blur_for_a_laplace_law_s_scale() -
     clues = Clues.of(Read(maps, TOLD, Part(0, 0, 384, 256), 2, (1.0,), 22.0), TOLD, "near", KNOWN[:1])
     fit = fit_focus(TOLD, [Sighting(LEFT_M, blur_px, 2**0.5 * scale)], is_near=True)
     assert clues.camera.focus_distance_m == pytest.approx(fit.focus_distance_m, rel=1e-3)
-    assert f"({fit.low_m:.3g} to {fit.high_m:.3g})" in clues.warnings[0]
+    assert f"({fit.low_m:.4g} to {fit.high_m:.4g})" in clues.warnings[0]
 
 
 def test_a_side_that_is_known_is_that_of_what_is_like_it_and_near_by(estimator: Estimator) -> None:

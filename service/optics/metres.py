@@ -1,0 +1,13 @@
+"""Metres as people read them."""
+
+import math
+
+CLOSE_M = 0.5
+CLOSE_DIGITS = 4
+
+
+def in_words(depth_m: float, like_m: float | None = None) -> str:
+    """To a millimetre, what is close to four digits; with as many decimals as another has, if one is given."""
+    like_m = depth_m if like_m is None else like_m
+    is_close = 0 < like_m < CLOSE_M
+    return f"{depth_m:.{CLOSE_DIGITS - 1 - math.floor(math.log10(like_m)) if is_close else 3}f}"
