@@ -158,7 +158,8 @@ class CameraSpecs(Given):
         if lens.focal_length_m >= self.focus_distance_m:
             raise BadRequest.at(
                 f"A lens of {lens.focal_length_mm:g} mm cannot focus at {self.focus_distance_m:g} m: "
-                "the focal length must be shorter than the focus distance.",
+                "the focal length must be shorter than the focus distance, which counts from the lens' front principal "
+                "plane and is f (1 + 1/m) at magnification m.",
                 "#/lens/focal_length_mm",
             )
         return lens.k_cam_px(self.focus_distance_m, self.image_width_px)

@@ -26,13 +26,16 @@ CROPPED, APPLIED = (re.compile(rb"crs:" + name + rb"(=[\'\"]|>)True", re.I) for 
 RENDERINGS = {b"GPano:ProjectionType": "a panorama", b"SpecialType-PORTRAIT": "a portrait mode"}
 SAMSUNG_PORTRAIT = b"Shot_DepthMap_"  # DualShot and SingeShot: a part behind the picture, with what it was blurred by
 ADVICE = "send the whole frame, for a part that is taken for a small copy gives wrong metres"
+MOSAIC_CELLS, MOSAIC_LEVELS, MOSAIC_ERRORS = 256, 1.5, 5.0  # looked at, each way; least of 255, and standard errors
 
 Grey = NDArray[np.uint8]
 
 
 def signs_of_making(data: bytes, header: Header, stored: NDArray[np.uint8]) -> Iterator[str]:
-    """Warnings where the stored frame [h, w, 3] RGB is a part of what was taken, or was computed."""
+    """Warnings where the stored frame [h, w, 3] RGB is a part of what was taken, was computed, or never developed."""
     yield from noted_making(data, header)
+    if _is_mosaic(stored):
+        yield "its grey pixels alternate, as a colour sensor's do before they are developed (Bayer): demosaic it first"
     if _is_noted_crop(header):
         return
     thumbnail = _thumbnail(header)
@@ -53,6 +56,20 @@ def noted_making(data: bytes, header: Header) -> Iterator[str]:
 
 def _is_noted_crop(header: Header) -> bool:
     return bool(CROPPED.search(header.xmp) and APPLIED.search(header.xmp))
+
+
+def _is_mosaic(stored: NDArray[np.uint8]) -> bool:
+    """Whether all is grey and one diagonal of every two by two pixels brighter, which is so of nothing a lens shows."""
+    height, width = (size // 2 for size in stored.shape[:2])
+    if not height or not width:
+        return False
+    down, across = (-(-size // MOSAIC_CELLS) for size in (height, width))
+    cells = stored[: 2 * height, : 2 * width].reshape(height, 2, width, 2, 3)[::down, :, ::across].astype(np.float32)
+    if (cells != cells[..., :1]).any():
+        return False
+    first, second, third, fourth = (cells[:, row, :, column, 0] for row in (0, 1) for column in (0, 1))
+    off = (first + fourth - second - third) / 2
+    return bool(abs(off.mean()) > MOSAIC_LEVELS + MOSAIC_ERRORS * off.std() / np.sqrt(off.size))
 
 
 def _thumbnail(header: Header) -> Grey | None:

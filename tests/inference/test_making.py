@@ -56,6 +56,27 @@ def test_a_picture_of_which_it_shows_no_more_is_not_doubted(whole: Picture) -> N
         assert read_photograph(with_thumbnail(picture, shown, bar_px=bar_px)).warnings == ()
 
 
+@pytest.mark.parametrize("first", [(0, 0), (0, 1), (1, 0), (1, 1)])
+def test_a_mosaic_that_was_never_developed_is_told_of(whole: Picture, first: tuple[int, int]) -> None:
+    mosaic = whole[..., 1].copy()
+    for row, column, channel in ((0, 0, 0), (1, 1, 2)):
+        place = np.s_[(row + first[0]) % 2 :: 2, (column + first[1]) % 2 :: 2]
+        mosaic[place] = whole[place][..., channel] * 0.8
+    for picture in (mosaic, mosaic[:-1, :-1]):
+        (warning,) = read_photograph(encoded(".png", np.ascontiguousarray(picture))).warnings
+        assert "demosaic it first" in warning
+
+
+def test_what_is_grey_or_no_more_than_noisy_is_no_mosaic(whole: Picture) -> None:
+    grey, noise = whole[..., 1].copy(), np.random.default_rng(0).integers(0, 255, (48, 64), np.uint8)
+    striped = grey.copy()
+    striped[::2] //= 2  # as fields of different light are
+    coloured = whole.copy()
+    coloured[::2, ::2] //= 2
+    for picture in (grey, noise, striped, grey[:1, :9], grey[:9, :1], coloured):
+        assert read_photograph(encoded(".png", np.ascontiguousarray(picture))).warnings == ()
+
+
 @pytest.mark.parametrize("data", [b"", b"no jpeg", b"\xff\xd8\xff" + bytes(50), jpeg(np.zeros((1200, 8, 3), np.uint8))])
 def test_what_is_no_thumbnail_is_passed_over(whole: Picture, data: bytes) -> None:
     assert read_photograph(with_exif(jpeg(whole), exif_with_thumbnail(data))).warnings == ()
