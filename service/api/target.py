@@ -23,7 +23,7 @@ def grid_of_query(
     try:
         return CircleGrid(kind, rows, columns, spacing_mm, diameter_mm)
     except ValueError as exc:
-        raise _misfit(exc) from exc
+        raise BadRequest.at(str(exc), "spacing_mm") from exc
 
 
 GridDep = Annotated[CircleGrid, Depends(grid_of_query)]
@@ -33,7 +33,7 @@ def _sheet(grid: GridDep, paper: Annotated[Paper, Query(description="The sheet")
     try:
         return lay_out(grid, paper)
     except ValueError as exc:
-        raise _misfit(exc) from exc
+        raise BadRequest.at(str(exc), "spacing_mm", "paper") from exc  # another paper, or printer, may do
 
 
 SheetDep = Annotated[Sheet, Depends(_sheet)]
@@ -61,7 +61,3 @@ def read_target_svg(sheet: SheetDep) -> Response:
 def read_target_pdf(sheet: SheetDep) -> Response:
     """A grid of circles in true millimetres, with a ruler to check the print."""
     return Response(as_pdf(sheet), media_type="application/pdf")
-
-
-def _misfit(cause: ValueError) -> BadRequest:
-    return BadRequest.at(str(cause), "spacing_mm")

@@ -63,6 +63,8 @@ export function SheetStep({ sheet, onChange, onNext }) {
 	const { picture, problem } = usePicture(sheet);
 	const [failed, setFailed] = useProblem();
 	const isNone = problem?.status === 422;
+	// of glass, film or larger paper there are such sheets
+	const isElsewhere = isNone && problem.errors.some(({ pointer }) => pointer === "paper");
 	const printed = patternOf(sheet);
 	const hasScale = isMeasured(sheet);
 	const fault = (/** @type {string} */ name) => problem?.errors.find(({ pointer }) => pointer === name)?.detail ?? "";
@@ -88,6 +90,12 @@ export function SheetStep({ sheet, onChange, onNext }) {
 			setFailed(problemOf(error));
 		}
 	}
+
+	const unseen = isElsewhere
+		? "Not to be printed here. If you have such a sheet, go on: it is calibrated with as well."
+		: isNone
+			? "There is no such sheet."
+			: (problem?.detail ?? "Drawing the sheet ...");
 
 	return html`
 		<div class="columns">
@@ -118,13 +126,13 @@ export function SheetStep({ sheet, onChange, onNext }) {
 				</details>
 				${isNone && !problem.errors.length && html`<p class="fault" role="alert">${problem.detail}</p>`}
 				<div class="row">
-					<button class="primary" disabled=${!hasScale || isNone} onClick=${onNext}>Next: photographs</button>
+					<button class="primary" disabled=${!hasScale || (isNone && !isElsewhere)} onClick=${onNext}>Next: photographs</button>
 				</div>
 			</div>
 			<figure class="card sheet">
 				${picture
 					? html`<img src=${picture} alt=${`The sheet: ${sheet.rows} rows and ${sheet.columns} columns of circles above a ruler`} />`
-					: html`<p class="hint">${isNone ? "There is no such sheet." : (problem?.detail ?? "Drawing the sheet ...")}</p>`}
+					: html`<p class="hint">${unseen}</p>`}
 			</figure>
 		</div>
 	`;

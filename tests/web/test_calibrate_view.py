@@ -85,7 +85,23 @@ def test_the_sheet_is_what_the_service_prints(page: Page, served: Server, expect
     page.get_by_text("Another grid or paper").click()
     page.get_by_label("Spacing (mm)").fill("60")
     expect(page.get_by_label("Spacing (mm)")).to_have_accessible_description(re.compile("too large for a4"))
+    expect(page.get_by_role("button", name="Download PDF")).to_be_disabled()
+    page.get_by_label("Spacing (mm)").fill("6")
+    expect(page.get_by_label("Spacing (mm)")).to_have_accessible_description(re.compile("touch"))
+    expect(page.get_by_text("There is no such sheet.")).to_be_visible()
     expect(page.get_by_role("button", name="Next: photographs")).to_be_disabled()
+
+
+def test_a_sheet_too_fine_to_print_here_is_calibrated_with(page: Page, expected_errors: list[str]) -> None:
+    expected_errors.append("status of 422")
+    page.goto("#calibrate")
+    page.get_by_text("Another grid or paper").click()
+    page.get_by_label("Diameter (mm)").fill("1.2")
+    page.get_by_label("Spacing (mm)").fill("1.5")
+    expect(page.get_by_label("Spacing (mm)")).to_have_accessible_description(re.compile("so fine a sheet is bought"))
+    expect(page.get_by_role("button", name="Download PDF")).to_be_disabled()
+    page.get_by_role("button", name="Next: photographs").click()
+    expect(page.get_by_text("Begin with one")).to_be_visible()
 
 
 def test_a_photograph_that_browsers_do_not_show_is_shown_with_its_circles(
