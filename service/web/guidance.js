@@ -91,7 +91,12 @@ function missingSide(seen, focus) {
 		// without a focal length there is no distance, but the sheet's size in the frame tells near from far
 		const sizes = defocused.map(sizeOf).sort((a, b) => a - b);
 		if (sizes.length > 0 && sizes[sizes.length - 1] > sizes[0] * SIDE ** 2) return null;
-		return sizes.length % 2 === 0 ? "nearer than the plane in focus" : "farther than the plane in focus";
+		// where k_cam is large no sheet is far from focus: what is blurred and larger than the sharpest is nearer
+		const clear = clearlyBlurred(defocused);
+		const larger = clear.filter((one) => sizeOf(one) > sizeOf(sharpestOf(defocused))).length;
+		if (Math.min(larger, clear.length - larger) >= WANTED_A_SIDE) return null;
+		const isNearer = clear.length === 0 ? sizes.length % 2 === 0 : larger <= clear.length - larger;
+		return isNearer ? "nearer than the plane in focus" : "farther than the plane in focus";
 	}
 	const clear = clearlyBlurred(defocused);
 	const count = (/** @type {(distance: number, edge: number) => boolean} */ isBeyond) =>
@@ -111,6 +116,11 @@ function missingSide(seen, focus) {
 function clearlyBlurred(defocused) {
 	const least = Math.min(...defocused.flatMap(({ blur }) => blur ?? []));
 	return defocused.filter(({ blur }) => blur !== null && blur >= BLUR_RATIO * least);
+}
+
+/** @param {Seen[]} seen not empty */
+function sharpestOf(seen) {
+	return seen.reduce((best, one) => (Number(one.blur ?? Infinity) < Number(best.blur ?? Infinity) ? one : best));
 }
 
 /** Where blur is `MOST_BLUR`, in focus distances from the plane in focus: it grows with |s1/z - 1|, a radius with 1/z. @param {Seen[]} clear @param {number} focus */

@@ -238,6 +238,41 @@ def test_a_set_is_good_where_blur_differs(page: Page, blurs: list[float], advice
 @pytest.mark.parametrize(
     ("distances", "advice"),
     [
+        ((0.1,), "Next: one farther than the plane in focus."),
+        ((0.1, 0.097, 0.096), "Next: one farther than the plane in focus."),
+        ((0.1, 0.097, 0.104, 0.105), "Next: one nearer than the plane in focus."),
+        ((0.1, 0.097, 0.096, 0.104, 0.105), "Next: 3 more, each at another distance and tilt."),
+    ],
+)
+def test_sides_are_told_apart_by_size_and_blur_where_no_distance_is_known(
+    page: Page, distances: tuple[float, ...], advice: str
+) -> None:
+    """A macro lens' photographs, without EXIF: k_cam is 100 px, and the sheet never 1.25 times as large."""
+    seen = [
+        {
+            "role": "defocused",
+            "width": 600,
+            "height": 400,
+            "orientation": 1,
+            "circles": [
+                {"u_px": 300 + 28 * x / z, "v_px": 200 + 18 * y / z, "radius_px": 3 / z}
+                for x in (-1, 1)
+                for y in (-1, 1)
+            ],
+            "blur": math.hypot(0.6, 100 * (0.1 / z - 1)),
+            "distance": None,
+            "tilt": None,
+        }
+        for z in distances
+    ]
+    page.goto("#calibrate")
+    told = page.evaluate("async (seen) => (await import('/web/guidance.js')).adviceFor(seen, null)", seen)
+    assert told.replace(", tilted by 15 to 25 degrees", "") == advice
+
+
+@pytest.mark.parametrize(
+    ("distances", "advice"),
+    [
         # a third of a circle's radius of blur is 0.012 m away
         ((0.2, 0.195), "Next: one at 0.206 to 0.212 m."),
         ((0.2, 0.195, 0.196, 0.21), "Next: one at 0.206 to 0.212 m."),
