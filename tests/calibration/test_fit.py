@@ -207,7 +207,8 @@ def test_by_a_large_k_cam_circles_tell_it_that_are_clearly_blurred_however_near_
 
 
 def test_close_by_a_focus_distance_is_contradicted_to_more_than_millimetres() -> None:
-    some = circles(BOTH_SIDES, error=0.0).scaled(depth=0.05, blur=1.0)
+    some = circles(BOTH_SIDES, error=0.0)
+    some = replace(some, depth_m=0.05 * some.depth_m)
     with pytest.raises(FitError, match=r"say 0\.0(6000|5999) m \(0\.0[56]\d\d\d to 0\.06\d\d\d\), not the 0.066 m"):
         fit_constants(some, 0.066, resamples=0)
 
