@@ -26,6 +26,7 @@ CROPPED, APPLIED = (re.compile(rb"crs:" + name + rb"(=[\'\"]|>)True", re.I) for 
 RENDERINGS = {b"GPano:ProjectionType": "a panorama", b"SpecialType-PORTRAIT": "a portrait mode"}
 SAMSUNG_PORTRAIT = b"Shot_DepthMap_"  # DualShot and SingeShot: a part behind the picture, with what it was blurred by
 ADVICE = "send the whole frame, for a part that is taken for a small copy gives wrong metres"
+GREY_EVERY = 16  # pixels each way, before all are looked at
 MOSAIC_CELLS, MOSAIC_LEVELS, MOSAIC_ERRORS = 256, 1.5, 5.0  # looked at, each way; least of 255, and standard errors
 
 Grey = NDArray[np.uint8]
@@ -61,15 +62,19 @@ def _is_noted_crop(header: Header) -> bool:
 def _is_mosaic(stored: NDArray[np.uint8]) -> bool:
     """Whether all is grey and one diagonal of every two by two pixels brighter, which is so of nothing a lens shows."""
     height, width = (size // 2 for size in stored.shape[:2])
-    if not height or not width:
+    if not height or not width or not _is_grey(stored[::GREY_EVERY, ::GREY_EVERY]):
         return False
     down, across = (-(-size // MOSAIC_CELLS) for size in (height, width))
     cells = stored[: 2 * height, : 2 * width].reshape(height, 2, width, 2, 3)[::down, :, ::across].astype(np.float32)
-    if (cells != cells[..., :1]).any():
+    if not _is_grey(cells):
         return False
     first, second, third, fourth = (cells[:, row, :, column, 0] for row in (0, 1) for column in (0, 1))
     off = (first + fourth - second - third) / 2
     return bool(abs(off.mean()) > MOSAIC_LEVELS + MOSAIC_ERRORS * off.std() / np.sqrt(off.size))
+
+
+def _is_grey(pixels: NDArray[np.generic]) -> bool:
+    return bool((pixels == pixels[..., :1]).all())
 
 
 def _thumbnail(header: Header) -> Grey | None:
