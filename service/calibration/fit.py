@@ -176,8 +176,9 @@ def _doubt(circles: Circles, given_m: float, fit: Fit, depth_error: float) -> tu
         return None if is_sure else (UNCHECKED, False)
     if own.low / OFF <= given_m <= own.high * OFF:
         return None
+    value, low, high = (in_words(depth_m, own.value) for depth_m in (own.value, own.low, own.high))
     told = (
-        f"the photographs say {in_words(own.value)} m ({in_words(own.low)} to {in_words(own.high)}), not the "
+        f"the photographs say {value} m ({low} to {high}), not the "
         f"{given_m:g} m given: check focus_distance_m, or leave it out, and the sheet's spacing"
     )
     if is_sure and not 1 / FAR_OFF < given_m / own.value < FAR_OFF:
