@@ -39,7 +39,7 @@ def camera_of(photograph: Photograph, camera: Camera) -> tuple[Camera, tuple[str
     turned = camera.turned(*TURNS[photograph.orientation])
     fitting = next((one for one in (turned, camera) if one.is_same_frame(width_px, height_px)), None)
     if fitting is None:
-        is_turned = any(one.is_same_frame(height_px, width_px) for one in (turned, camera))
+        is_turned = camera.is_same_frame(height_px, width_px)
         advice = (
             "send the original, whose EXIF says how the camera was held, or register a camera of that size"
             if is_turned

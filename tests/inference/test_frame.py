@@ -95,6 +95,7 @@ def test_a_frame_made_larger_scales_gamma_alike() -> None:
         (Exif(focal_length_mm=50.0, f_number=1.8), "its EXIF says 50 mm f/1.8, the camera is 50 mm f/1.2"),
         (Exif(f_number=1.8), "its EXIF says f/1.8, the camera is 50 mm f/1.2"),
         (Exif(focal_length_mm=53.0), "its EXIF says 53 mm, the camera is 50 mm f/1.2"),
+        (Exif(focal_length_mm=35.0), "its EXIF says 35 mm, the camera is 50 mm f/1.2"),
         (Exif(focal_length_mm=52.0, f_number=1.25), ""),
         (Exif(), ""),
     ],
@@ -128,10 +129,22 @@ def test_a_digital_zoom_is_told_of_whatever_the_camera_was_made_from() -> None:
         ((5712, 4284), 12, {}, True),
         ((5712, 4284), 48, {"digital_zoom": 2.0}, False),
         ((5712, 4284), 120, {"focal_length_mm": 15.7}, False),
+        ((5712, 4284), 13, {"focal_length_mm": 2.2}, False),
         ((5712, 4284), 24, {"focal_length_mm": None}, False),
         ((5712, 4284), None, {}, False),
     ],
-    ids=["whole", "16:9", "square", "2x", "whole, by a 2x", "zoom that is told", "other lens", "no lens", "no word"],
+    ids=[
+        "whole",
+        "16:9",
+        "square",
+        "2x",
+        "whole, by a 2x",
+        "zoom that is told",
+        "longer lens",
+        "wider lens",
+        "no lens",
+        "no word",
+    ],
 )
 def test_a_part_of_the_sensor_that_no_zoom_tells_of_is_known_by_its_field_of_view(
     size_px: tuple[int, int], equivalent_mm: float | None, tags: dict[str, Any], *, is_another: bool
@@ -156,6 +169,7 @@ def test_a_zoom_of_a_calibrated_camera_is_known_by_what_a_pixel_measures(
         assert not [*maybe_another_part(replace(exif, **unknown), calibrated)]
     resized = replace(exif, focal_length_mm=50.0, focal_plane_pitch_um=1.5)  # by a program that left the pitch
     assert not [*maybe_another_part(resized, replace(calibrated, focal_length_m=0.05))]
+    assert not [*maybe_another_part(resized, replace(calibrated, focus_distance_m=0.05))]  # no 50 mm lens is so near
 
 
 def test_a_lens_focused_close_may_see_less_than_its_equivalent_tells() -> None:
@@ -199,6 +213,7 @@ def test_infinity_agrees_with_any_focus_that_no_ring_has_a_figure_for() -> None:
     infinite = Exif(focal_length_mm=50.0, subject_distance_m=math.inf)
     for focus_m, is_other in ((30.0, True), (50.0, False), (1e5, False)):
         assert len([*taken_otherwise(infinite, CAMERA.focused_at(focus_m), is_refocused=False)]) == is_other
+    assert [*taken_otherwise(Exif(subject_distance_m=2.0), CAMERA.focused_at(1e5), is_refocused=False)]
 
 
 @pytest.mark.parametrize(
@@ -248,6 +263,8 @@ def test_another_frame_is_refused_with_both_sizes(width: int, height: int, advic
 def test_a_focus_distance_that_may_be_in_millimetres_is_told(focus_m: float, *, is_told: bool) -> None:
     _, warnings = camera_of(photograph(640, 480), CAMERA.focused_at(focus_m))
     assert [f"focused at {focus_m:g} m" in words for words in warnings] == [True] * is_told
+    _, warnings = camera_of(photograph(320, 240), CAMERA.focused_at(focus_m))
+    assert any(f"focused at {focus_m:g} m" in words for words in warnings) == is_told
 
 
 @pytest.mark.parametrize(
@@ -297,6 +314,13 @@ def test_intrinsics_of_another_size_are_told_by_where_their_axis_is(ratio: float
     assert [f"({calibrated.cx_px:.4g}, " in words and "of 1280x960" in words for words in said] == [True] * is_told
     assert not [*maybe_of_another_size(CAMERA)]
     assert not [*maybe_of_another_size(replace(CAMERA, intrinsics=None))]
+
+
+@pytest.mark.parametrize("off_px", [(200, 0), (-200, 0), (0, 150), (0, -150)])
+def test_an_axis_off_the_middle_one_way_is_told(off_px: tuple[int, int]) -> None:
+    camera = Camera(1280, 960, 2.0, 3.8, intrinsics=Intrinsics.centred(900.0, 1280, 960))
+    assert not [*maybe_of_another_size(camera)]
+    assert [*maybe_of_another_size(camera.cropped(*off_px, 1280, 960))]
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from service.inference.artifact import load_model_folder
 from service.inference.cancellation import Cancellation
 from service.inference.copies import Read
 from service.inference.estimator import Estimator
-from service.inference.known import Clues, KnownDepth
+from service.inference.known import LIKE_BLUR, REACH, Clues, KnownDepth
 from service.inference.pair import GraphPair, RawMaps, Side, Sights
 from service.inference.part import Part
 from service.optics.camera import Camera
@@ -102,23 +102,32 @@ def test_a_side_that_is_known_is_that_of_what_is_like_it_and_near_by(estimator: 
     assert (answer.p_near[30:50, 320:340] < 0.1).all()
 
 
-def test_things_of_other_blur_are_told_less(estimator: Estimator) -> None:
-    picture = photograph(red=EVENLY)
-    picture[100:140, 70:90] = photograph(red=EVENLY)[0, 300]
-    p_near = estimator.estimate(picture, TOLD, known=KNOWN[:1]).p_near
-    assert p_near[120, 60] > p_near[120, 80]
-    assert p_near[120, 60] > p_near[120, 150] > 0.5
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_a_known_depth_speaks_for_what_is_near_by_and_as_blurred_on_any_copy(scale: float) -> None:
+    rows, columns = round(128 * scale), round(192 * scale)
+    values = {"blur_px": TRUE.blur_px(LEFT_M) * scale, "blur_log_error": -3.0, "p_near": 0.9}
+    maps = {name: np.full((rows, columns), value, np.float32) for name, value in values.items()}
+    maps["blur_px"][: rows // 2] *= np.exp(LIKE_BLUR)
+    copied = TOLD.resized(2 * columns, 2 * rows)
+    read = Read(maps, copied, Part(0, 0, 384, 256), 2, (scale,), 22.0)
+    likeness = Clues.of(read, TOLD, "auto", [KnownDepth(100, 130, LEFT_M)]).likeness(read)[0]
+    there, above = read.cell_of(100, 130), read.cell_of(100, 125)
+    beside, below = read.cell_of(100 + REACH * 384, 130), read.cell_of(100, 130 + REACH * 384)
+    assert likeness[there] == pytest.approx(1, abs=0.01)
+    assert [likeness[cell] for cell in (above, beside, below)] == pytest.approx([np.exp(-0.5)] * 3, abs=0.03)
 
 
-def test_where_the_model_mistakes_a_side_all_others_are_doubted(estimator: Estimator) -> None:
-    other_m = 0.95
+@pytest.mark.parametrize(("other_m", "red", "more"), [(0.95, 20, 0.1), (RIGHT_M, 180, -0.1)])
+def test_where_the_model_mistakes_a_side_all_others_are_doubted(
+    estimator: Estimator, other_m: float, red: int, more: float
+) -> None:
     picture = photograph(red=100)
     picture[:40, :40] = brightness_for(TRUE.blur_px(other_m))
-    picture[:40, :40, 0] = 20  # taken for far, though near
+    picture[:40, :40, 0] = red  # taken for the other side's
     before, after = (
         estimator.estimate(picture, TOLD, known=known).p_near[250, 380] for known in ((), [KnownDepth(10, 10, other_m)])
     )
-    assert after > before + 0.1
+    assert (after - before) / more > 1
 
 
 def test_where_depth_is_known_the_answer_is_that_and_far_from_there_it_is_the_blurs(estimator: Estimator) -> None:
