@@ -148,7 +148,7 @@ def _is_cut(exif: Exif, aspect: float) -> bool:
 def _stated_width_px(exif: Exif, aspect: float) -> int | None:
     """The width the picture had in the camera; who turns pixels upright may leave its EXIF as it was."""
     width_px, height_px = exif.width_px, exif.height_px
-    if not width_px or not height_px or width_px == height_px:
+    if not width_px or not height_px:
         return width_px
     is_turned = math.isclose(height_px / width_px, aspect, rel_tol=ASPECT_TOLERANCE)
     return height_px if is_turned else width_px
@@ -220,7 +220,7 @@ def _sensor_widths_mm(
         crops.append((exif.focal_length_35mm / exif.focal_length_mm / exif.zoom, words))
     for crop, words in crops:
         width_mm = FULL_FRAME_DIAGONAL_MM / (crop or math.inf) * aspect / math.hypot(aspect, 1)
-        if crop and SENSOR_WIDTHS_MM[0] <= width_mm <= SENSOR_WIDTHS_MM[1]:
+        if SENSOR_WIDTHS_MM[0] <= width_mm <= SENSOR_WIDTHS_MM[1]:
             yield width_mm, (words.format(crop), *shape)
 
 

@@ -18,7 +18,7 @@ from tests.inference.photographs import ExifValue, corners, exif_of, jpeg, png, 
 
 MAKE, MODEL = 271, 272
 F_NUMBER, FOCAL, SUBJECT, WIDTH, FOCAL_35, ZOOM, LENS = 0x829D, 0x920A, 0x9206, 0xA002, 0xA405, 0xA404, 0xA434
-PLANE_RESOLUTION, PLANE_UNIT, RENDERED = 0xA20E, 0xA210, 0xA401
+HEIGHT, PLANE_RESOLUTION, PLANE_UNIT, RENDERED = 0xA003, 0xA20E, 0xA210, 0xA401
 NIKON = {MAKE: "NIKON CORPORATION", MODEL: "NIKON D200"}
 SHOT: dict[int, ExifValue] = {F_NUMBER: (28, 10), FOCAL: (350, 10), FOCAL_35: 52, WIDTH: 3872}
 D200 = Exif("NIKON CORPORATION", "NIKON D200", None, 35.0, 52.0, 2.8, None, None, 3872, None, None)
@@ -34,9 +34,9 @@ def said(drafted: Draft, *words: str) -> bool:
 
 def test_tags_are_read_from_a_jpeg_s_exif() -> None:
     shot = SHOT | {SUBJECT: (2000, 1000), ZOOM: (1, 1), LENS: "35mm f/2", PLANE_RESOLUTION: (4164, 1), PLANE_UNIT: 3}
-    found = read_exif(read_header(with_exif(jpeg(corners()), exif_of(NIKON, shot))).exif)
+    found = read_exif(read_header(with_exif(jpeg(corners()), exif_of(NIKON, shot | {HEIGHT: 2592}))).exif)
     assert replace(found, focal_plane_pitch_um=None) == replace(
-        D200, lens="35mm f/2", subject_distance_m=2.0, digital_zoom=1.0
+        D200, lens="35mm f/2", subject_distance_m=2.0, digital_zoom=1.0, height_px=2592
     )
     assert found.focal_plane_pitch_um == pytest.approx(1e4 / 4164)
 
@@ -101,6 +101,8 @@ def test_a_list_of_cameras_knows_the_sensor() -> None:
     assert (drafted.lens.focal_length_mm, drafted.lens.f_number, drafted.lens.sensor_width_px) == (35.0, 2.8, 3872)
     assert said(drafted, "crop factor")
     assert said(drafted, "focus_distance_m is needed")
+    for words in ("digital zoom", "neither 4:3 nor 3:2", "pitch in its EXIF alone"):
+        assert not said(drafted, words)
 
 
 def test_the_pixel_pitch_of_the_exif_comes_first() -> None:
@@ -114,6 +116,7 @@ def test_a_pitch_that_nothing_else_agrees_with_is_told() -> None:
     assert said(draft(2048, 1365, **alone, width_px=2048), "7.62 mm wide by the pixel pitch", "check lens.pixel_pitch")
     for known in ({"focal_length_35mm": 52.0}, {"model": "NIKON D200"}):
         assert not said(draft(**alone | {"focal_plane_pitch_um": 6.05} | known), "pitch in its EXIF alone")
+    assert not said(draft(focal_length_35mm=None), "pitch in its EXIF alone")
 
 
 @pytest.mark.parametrize(
@@ -137,12 +140,23 @@ def test_a_picture_whose_pixels_were_turned_is_as_wide_as_it_was_high() -> None:
     turned = draft(2592, 3872, height_px=2592, focal_plane_pitch_um=6.05)
     assert (turned.lens.pixel_pitch_um, turned.lens.sensor_width_px) == (6.05, 2592)
     assert not said(turned, "resized")
+    assert not said(turned, "neither 4:3 nor 3:2")
+    copy = draft(645, 966, height_px=2592, focal_plane_pitch_um=6.05)
+    assert (copy.lens.pixel_pitch_um, copy.lens.sensor_width_px) == (6.05, 2592)
+
+
+def test_a_square_is_cut_out_of_a_sensor_that_its_lens_is_made_for() -> None:
+    square: dict[str, Any] = {"make": "Nobody", "model": None, "width_px": 3024, "height_px": 3024}
+    drafted = draft(3024, 3024, **square, focal_length_mm=4.25, focal_length_35mm=26.0, focal_plane_pitch_um=1.4)
+    assert (drafted.lens.pixel_pitch_um, said(drafted, "also says")) == (1.4, False)
 
 
 def test_a_pitch_that_cannot_be_is_not_believed() -> None:
     drafted = draft(focal_plane_pitch_um=300.0)
     assert drafted.lens.pixel_pitch_um == pytest.approx(6.05, rel=0.01)
     assert said(drafted, "cannot be")
+    unbelievable = draft(make="Nobody", focal_length_35mm=3500.0)
+    assert unbelievable.lens.pixel_pitch_um is None
 
 
 def test_the_equivalent_tells_the_sensor_but_is_no_focal_length() -> None:
@@ -169,12 +183,13 @@ def test_a_list_that_has_another_lens_of_a_phone_does_not_outweigh_its_exif() ->
     )
     assert drafted.lens.pixel_pitch_um == pytest.approx(1.8, rel=0.01)
     assert said(drafted, "list of cameras also says 5.77")
+    assert (drafted.name, drafted.description) == ("samsung-sm-g991b-5.4mm-f2.8", "samsung SM-G991B")
 
 
 @pytest.mark.parametrize(
     ("size_px", "focal_length_mm", "is_told"),
-    [((4000, 3000), 26.0, True), ((3000, 4000), 26.0, True), ((6000, 4000), 26.0, False), ((4000, 3000), 6.8, False)],
-    ids=["phone", "held upright", "full frame", "real"],
+    [((4000, 3000), 26.0, True), ((3000, 4000), 26.0, True), ((2592, 3872), 26.0, False), ((4000, 3000), 6.8, False)],
+    ids=["phone", "held upright", "full frame, upright", "real"],
 )
 def test_an_equivalent_that_stands_for_the_focal_length_is_told(
     size_px: tuple[int, int], focal_length_mm: float, *, is_told: bool
@@ -213,10 +228,12 @@ def test_a_sensor_as_wide_as_its_picture_is_drafted_only_where_something_says_so
 
 
 def test_a_file_made_small_belongs_to_the_whole_sensor() -> None:
-    drafted = draft(645, 432)
-    assert (drafted.image_width_px, drafted.lens.sensor_width_px) == (645, 3872)
-    assert drafted.lens.pixel_pitch_um == pytest.approx(6.05, rel=0.01)
-    assert said(drafted, "resized")
+    for tags in ({}, {"height_px": 2592}, {"focal_plane_pitch_um": 6.05}):
+        drafted = draft(645, 432, **tags)
+        assert (drafted.image_width_px, drafted.lens.sensor_width_px) == (645, 3872)
+        assert drafted.lens.pixel_pitch_um == pytest.approx(6.05, rel=0.01)
+        assert said(drafted, "resized")
+    assert draft(645, 432, width_px=None, height_px=2592).lens.sensor_width_px == 645
 
 
 def test_a_part_of_the_frame_is_told_by_its_shape_and_not_taken_for_a_small_copy() -> None:
@@ -225,7 +242,7 @@ def test_a_part_of_the_frame_is_told_by_its_shape_and_not_taken_for_a_small_copy
         cut = draft(width_px, height_px, **stated)
         assert said(cut, "4032x3024", "draft from the whole frame")
         assert not said(cut, "resized")
-    for width_px, height_px in ((4032, 3024), (3024, 4032), (2016, 1512), (768, 1024)):
+    for width_px, height_px in ((4032, 3024), (3024, 4032), (2016, 1512), (768, 1024), (1000, 751)):
         assert not said(draft(width_px, height_px, **stated), "whole frame")
 
 
@@ -277,7 +294,12 @@ def test_damaged_exif_harms_nobody() -> None:
         draft_camera(read_exif(bytes(damaged[: draw.randint(1, len(whole))])), 8, 8)
 
 
-@pytest.mark.parametrize(("unit", "pixels"), [(2, 4198), (3, 1653), (4, 165), (5, 0.1653)])
-def test_a_pixel_is_as_wide_in_every_unit(unit: int, pixels: float) -> None:
-    found = read_exif(exif_of({}, {PLANE_RESOLUTION: (round(1e4 * pixels), 10_000), PLANE_UNIT: unit}))
+@pytest.mark.parametrize(("unit", "pixels"), [(None, 4198), (2, 4198), (3, 1653), (4, 165), (5, 0.1653)])
+def test_a_pixel_is_as_wide_in_every_unit(unit: int | None, pixels: float) -> None:
+    tags: dict[int, ExifValue] = {PLANE_RESOLUTION: (round(1e4 * pixels), 10_000)}
+    found = read_exif(exif_of({}, tags if unit is None else tags | {PLANE_UNIT: unit}))
     assert found.focal_plane_pitch_um == pytest.approx(6.05, rel=2e-3)
+
+
+def test_of_no_unit_a_pixel_has_no_width() -> None:
+    assert read_exif(exif_of({}, {PLANE_RESOLUTION: (4198, 1), PLANE_UNIT: 1})).focal_plane_pitch_um is None
