@@ -74,7 +74,7 @@ class _Request:
         if border is None:
             return self
         said = f"a black border, {fraction(border):.0%} of the photograph, shows nothing: no answer there"
-        return replace(self, rgb=continued(self.rgb, border), border=border, warnings=(*self.warnings, said))
+        return replace(self, rgb=continued(self.rgb, border), border=border, warnings=(said,))
 
     def area(self, scale: float, multiple: int) -> Part:
         """What a copy of this scale shows: the photograph, or the part and what the copy needs around it.

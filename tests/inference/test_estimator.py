@@ -170,6 +170,12 @@ def test_no_photograph_is_sharper_than_its_gamma(estimator: Estimator) -> None:
     np.testing.assert_allclose(answer.depth_m[:, :40], CAMERA.focus_distance_m, rtol=3e-3)
     np.testing.assert_allclose(answer.depth_m[:, 56:], thin_lens.depth_near(x, CAMERA.focus_distance_m), rtol=3e-3)
     assert answer.warnings == ("gamma_px taken as 1.02, where 3 was told: the photograph is sharper than that",)
+    bordered = half_sharp(1.0)
+    bordered[:, -8:] = 0
+    assert estimator.estimate(bordered, soft, "near").warnings == (
+        "a black border, 8% of the photograph, shows nothing: no answer there",
+        *answer.warnings,
+    )
 
 
 @pytest.mark.parametrize("gamma_px", [0.0, 0.5, 1.3])
