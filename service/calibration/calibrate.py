@@ -26,6 +26,7 @@ from service.calibration.report import Method, PictureReport, Report, Result, Ro
 from service.calibration.solve import FEW_VIEWS
 from service.calibration.target import CircleGrid
 from service.errors import CamindError
+from service.optics.camera import Intrinsics
 
 Tell = Callable[[float, tuple[PictureReport, ...]], None]
 
@@ -149,7 +150,7 @@ def _result(task: Task, measured: list[Measured], at: Callable[[float], None]) -
         blur_px = float(np.median(one.blur_px()))
         one.report = replace(one.report, distance_m=distance, tilt_deg=tilt, blur_px=blur_px)
     samples = tuple(_samples(usable, circles, constants))
-    corners = _corner_ratio(samples, placement, size_px)
+    corners = _corner_ratio(samples, placement.intrinsics, size_px)
     f_number, apertures = aperture_of(usable)
     return Result(
         *size_px,
@@ -311,9 +312,9 @@ def _left_out(measured: list[Measured], usable: list[Measured]) -> Iterator[str]
         yield f"{len(measured) - len(usable)} of {len(measured)} photographs were of no use: see what each of them says"
 
 
-def _corner_ratio(samples: tuple[Sample, ...], placement: Placement, size_px: tuple[int, int]) -> float | None:
+def _corner_ratio(samples: tuple[Sample, ...], intrinsics: Intrinsics, size_px: tuple[int, int]) -> float | None:
     """k_cam in the corners over that in the middle; None where too few circles were."""
-    middle, reach = (placement.intrinsics.cx_px, placement.intrinsics.cy_px), math.hypot(*size_px) / 2
+    middle, reach = (intrinsics.cx_px, intrinsics.cy_px), math.hypot(*size_px) / 2
     told = [
         (math.dist((sample.u_px, sample.v_px), middle) / reach, sample.k_cam_px)
         for sample in samples

@@ -9,6 +9,8 @@ import pytest
 
 from model_export.photographed_sheets import picture
 from service.calibration.calibrate import Picture, Shot, Task, calibrate
+from service.calibration.calibrate import _corner_ratio as corner_ratio
+from service.calibration.calibrate import _uneven as uneven
 from service.calibration.measure import Measured, aperture_of, ill_exposed, measure, too_blurred
 from service.calibration.plot import as_svg
 from service.calibration.report import PictureReport, Report, Role
@@ -91,13 +93,33 @@ def test_a_partner_that_comes_later_serves_as_well() -> None:
     assert "looked for the circles where its focused partner has them" in found.warnings
 
 
-def test_a_portrait_among_landscapes_is_turned(taken: list[SheetPhoto]) -> None:
+def test_a_portrait_among_landscapes_is_turned_and_circles_of_another_size_are_told_of(taken: list[SheetPhoto]) -> None:
     turned: list[SheetPhoto] = [
         (name, role, np.rot90(p, -1).copy() if i == 2 else p) for i, (name, role, p) in enumerate(taken)
     ]
-    found = calibrate(Task(GRID), pictures(turned)).result
+    found = calibrate(Task(replace(GRID, diameter_mm=22.0)), pictures(turned)).result
     assert found is not None
     assert found.k_cam_px.value == pytest.approx(4.0, rel=0.04)
+    assert [words.startswith("the circles are 0.8") for words in found.warnings] == [True]
+
+
+@pytest.mark.parametrize(("in_corners", "is_told"), [(4.2, False), (3.4, True), (4.6, True)])
+def test_blur_that_is_otherwise_in_the_corners_is_told_where_enough_circles_are_there(
+    report: Report, in_corners: float, *, is_told: bool
+) -> None:
+    assert report.result is not None
+    placed = replace(report.result.intrinsics, cx_px=399.5, cy_px=299.5)
+
+    def ratio(used: int) -> float | None:
+        (one, *_) = report.result.samples if report.result else ()
+        rows = [(400, 300, 4.0), (450, 380, 4.0), (650, 500, 9.0), (90, 560, in_corners), (710, 40, in_corners)]
+        samples = [replace(one, u_px=u, v_px=v, k_cam_px=k, used=i < used) for u, v, k in rows for i in range(8)]
+        return corner_ratio(tuple(samples), placed, (800, 600))
+
+    assert ratio(5) is None
+    assert ratio(6) == pytest.approx(in_corners / 4)
+    assert len([*uneven(ratio(6))]) == is_told
+    assert not [*uneven(None)]
 
 
 def test_all_in_focus_is_a_problem_and_no_k_cam(taken: list[SheetPhoto]) -> None:
