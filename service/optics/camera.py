@@ -84,8 +84,6 @@ class Intrinsics:
         ``size_px`` is the width and height after the transposition. Tangential, thin-prism and tilt terms turn with the
         picture; transposed, two tilts at once do so but for half their product.
         """
-        if not (transposed or flip_u or flip_v):
-            return self
         fx_px, fy_px, cx_px, cy_px = self.fx_px, self.fy_px, self.cx_px, self.cy_px
         terms = list(self.distortion)
         if transposed:

@@ -23,6 +23,7 @@ TRUE = TOLD.focused_at(1.8)
 LEFT_M, RIGHT_M = 1.0, 3.0
 KNOWN = (KnownDepth(60, 120, LEFT_M), KnownDepth(330, 40, RIGHT_M))
 EVENLY = 128
+SIDES: tuple[Side, Side] = ("near", "far")
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +92,15 @@ def test_the_interval_told_takes_the_error_of_blur_for_a_laplace_law_s_scale() -
     fit = fit_focus(TOLD, [Sighting(LEFT_M, blur_px, 2**0.5 * scale)], is_near=True)
     assert clues.camera.focus_distance_m == pytest.approx(fit.focus_distance_m, rel=1e-3)
     assert f"({fit.low_m:.4g} to {fit.high_m:.4g})" in clues.warnings[0]
+
+
+def test_of_one_thing_close_to_focus_the_side_asked_for_tells_where_focus_was() -> None:
+    values = {"blur_px": TOLD.blur_px(1.9), "blur_log_error": -3.0, "p_near": 0.5}
+    maps = {name: np.full((128, 192), value, np.float32) for name, value in values.items()}
+    read = Read(maps, TOLD, Part(0, 0, 384, 256), 2, (1.0,), 22.0)
+    near, far = (Clues.of(read, TOLD, side, [KnownDepth(9, 9, 1.9)]).camera for side in SIDES)
+    assert near.focus_distance_m == pytest.approx(2.0, rel=0.01)
+    assert far.focus_distance_m < 1.95
 
 
 def test_a_side_that_is_known_is_that_of_what_is_like_it_and_near_by(estimator: Estimator) -> None:
@@ -313,12 +323,13 @@ def test_a_known_depth_makes_no_answer(estimator: Estimator) -> None:
     answer = estimator.estimate(picture, TOLD, "far", known=(*KNOWN, KnownDepth(20, 20, 0.7)))
     assert not answer.valid[20, 20]
     assert answer.valid[40, 330]
+    assert not any("is answered at 20,20" in warning for warning in answer.warnings)
 
 
 def test_a_part_may_be_far_from_what_is_known(estimator: Estimator) -> None:
     camera = Camera(1200, 900, 2.0, 4.0, 0.5)
     picture = np.full((900, 1200, 3), brightness_for(camera.blur_px(LEFT_M)), np.uint8)
     part = Part(0, 0, 100, 50)
-    answer = estimator.estimate(picture, camera, part=part, known=[KnownDepth(1100, 800, LEFT_M)])
+    answer = estimator.estimate(picture, camera, part=part, known=[KnownDepth(1100.4, 799.6, LEFT_M)])
     assert answer.depth_m.shape == (50, 100)
     np.testing.assert_allclose(answer.depth_m, LEFT_M, rtol=0.05)

@@ -72,6 +72,11 @@ def test_averaging_areas_leaves_the_rest_of_gamma_and_a_box(times: int) -> None:
     assert large.averaged(640, 480) is large
 
 
+def test_an_axis_in_the_middle_is_between_the_middle_pixels() -> None:
+    centred = Intrinsics.centred(500.0, 4, 3)
+    assert (centred.cx_px, centred.cy_px) == (1.5, 1.0)
+
+
 def test_the_centre_of_the_image_stays_its_centre() -> None:
     scaled = Intrinsics(500, 500, 319.5, 239.5).scaled(0.25, 0.25)
     assert (scaled.cx_px, scaled.cy_px) == pytest.approx((79.5, 59.5))
