@@ -50,6 +50,15 @@ def test_where_k_cam_is_large_the_focus_distance_is_found_as_finely_as_blur_tell
     assert max(fit.deviations) < 0.5
 
 
+@pytest.mark.parametrize(("true_m", "depth_m"), [(0.193, 0.2), (0.186, 0.2), (0.2137, 0.22)])
+def test_where_k_cam_is_large_one_thing_is_blurred_by_the_focus_found_exactly_as_it_was(
+    true_m: float, depth_m: float
+) -> None:
+    fit = fitted(true_m, depth_m, told=Camera(1440, 1080, 0.2, 800.0, 0.6, focal_length_m=0.05))
+    assert fit.focus_distance_m == pytest.approx(true_m, rel=1e-5)
+    assert fit.deviations == pytest.approx((0.0,), abs=1e-6)
+
+
 def test_things_out_of_focus_tell_no_gamma() -> None:
     true = replace(CAMERA, gamma_px=0.8)
     fit = fit_focus(CAMERA, [Sighting(depth_m, true.blur_px(depth_m), EXACT) for depth_m in (0.5, 0.8)])
