@@ -27,6 +27,8 @@ def confine(memory_bytes: int, cpu_s: int) -> None:
         resource.RLIMIT_FSIZE: 0,
         resource.RLIMIT_CORE: 0,
     }
+    if sys.platform == "darwin":
+        del bounds[resource.RLIMIT_AS]  # macOS refuses any such bound
     for limit, most in bounds.items():
         resource.setrlimit(limit, (most, most))
 

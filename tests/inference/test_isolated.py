@@ -38,6 +38,19 @@ codec.open_heif, codec.options = open_heif, types.ModuleType("pi_heif.options")
 sys.modules["pi_heif"] = codec
 runpy.run_path({program!r}, run_name="__main__")
 """
+MACOS = """
+import resource, runpy, sys
+
+bound = resource.setrlimit
+
+def setrlimit(kind, bounds):
+    if kind == resource.RLIMIT_AS:
+        raise ValueError("current limit exceeds maximum limit")
+    bound(kind, bounds)
+
+sys.platform, resource.setrlimit = "darwin", setrlimit
+runpy.run_path({program!r}, run_name="__main__")
+"""
 MISDEEDS = {
     "sleeps for ever": "time.sleep(1000)",
     "computes for ever": "while True: pass",
@@ -68,6 +81,13 @@ def misbehave(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[str]
 
 def near(found: object, wanted: object) -> None:
     assert np.abs(np.asarray(found).astype(int) - np.asarray(wanted).astype(int)).max() <= 6
+
+
+def test_a_system_that_bounds_no_memory_decodes_all_the_same(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    program = tmp_path / "macos.py"
+    program.write_text(MACOS.format(program=str(isolated.PROGRAM)))
+    monkeypatch.setattr(isolated, "PROGRAM", program)
+    near(read_photograph(heic()).rgb, corners())
 
 
 @pytest.mark.parametrize("orientation", TURNS)
