@@ -81,7 +81,7 @@ def _training_parts() -> Iterator[None]:
         with Console(stderr=True).status("loading"):
             yield
     except ModuleNotFoundError as exc:
-        raise _fail(f"{exc.name} is not installed: pip install 'camind[train]' brings it") from exc
+        raise _fail(f"{exc.name} is not installed: `make setup` brings it, or pip install 'camind[train]'") from exc
 
 
 @contextmanager

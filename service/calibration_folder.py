@@ -11,7 +11,7 @@ from service.calibration.calibrate import Picture, Shot, Task, calibrate
 from service.calibration.fit import Interval
 from service.calibration.report import PictureReport, Report, Role
 from service.errors import InvalidImage
-from service.file_names import name_column, shown
+from service.file_names import name_column, print_table, shown
 from service.inference.images import SUFFIXES, ImageLimits, photographs_in, read_stored_frame
 from service.optics.metres import in_words
 
@@ -59,7 +59,7 @@ def calibrate_folder(folder: Path, task: Task, limits: ImageLimits) -> Report:
 
         report = calibrate(task, pictures, tell=tell)
         progress.update(bar, completed=1.0)
-    Console(markup=False, emoji=False).print(_table(report))  # a file's name is no markup
+    print_table(_table(report))
     return report
 
 

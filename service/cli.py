@@ -38,6 +38,7 @@ MOST_DAYS = 36_500.0  # the calendar has an end
 
 app = typer.Typer(
     help="Metres from one photograph, for any camera.",
+    context_settings={"help_option_names": ["--help", "-h"], "max_content_width": 120},
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,

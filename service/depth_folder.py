@@ -16,7 +16,7 @@ from service.api.problems import invalid_model
 from service.api.uploads import Upload
 from service.config import Settings
 from service.errors import CamindError
-from service.file_names import name_column, shown
+from service.file_names import name_column, print_table, shown
 from service.inference.artifact import load_model_folder
 from service.inference.cancellation import Cancellation
 from service.inference.estimator import Estimator
@@ -171,10 +171,9 @@ def _print(made: Sequence[tuple[Path, Made]]) -> None:
             found = (at.depth_m, at.sigma_m, at.depth_alt_m)
             told = (_metres(value, at.depth_m) for value in found)
             points.add_row(shown(path.name), f"{at.u:g}", f"{at.v:g}", *told)
-    console = Console(markup=False, emoji=False)  # a file's name is no markup
     for table in (depths, points):
         if table.row_count:
-            console.print(table)
+            print_table(table)
 
 
 def _metres(value: float | None, like: float | None = None) -> str:
