@@ -73,7 +73,7 @@ def serve(
     host: Annotated[str | None, typer.Option(help="Address to bind. [default: 127.0.0.1]")] = None,
     port: Annotated[int | None, typer.Option(help="TCP port, 0 for any. [default: 8000]")] = None,
     model: Annotated[Path | None, typer.Option(help="Model folder. [default: the shipped model]")] = None,
-    seed: Annotated[bool, typer.Option("--seed", help="Give a new database the paper's cameras")] = False,
+    seed: Annotated[bool, typer.Option("--seed", help="Give a database that never had a camera the paper's")] = False,
 ) -> None:
     """Answer requests until stopped. Everything else is set by CAMIND_* variables.
 
@@ -94,10 +94,9 @@ def serve(
         load_model_folder(settings.served_model_dir)
         served = create_app(settings)
         _require_sound(settings)
-        is_seeded = seed and settings.is_database_embedded and not _database_file(settings).exists()
         with _opened(settings) as engine:
-            if is_seeded:
-                _seed(engine, LOCAL)
+            if seed and settings.is_database_embedded:
+                _seed_new(engine)
             if settings.wants_keys:
                 _require_key(settings, engine)
         Spool(settings.spool_dir)
@@ -337,6 +336,14 @@ def _seed(engine: Engine, owner: str) -> list[str]:
     from service.storage.seeds import seed
 
     return seed(Cameras(engine, owner))
+
+
+def _seed_new(engine: Engine) -> None:
+    """Seed a database that is new, as it is too where an earlier start or command made it and came no further."""
+    from service.storage.cameras import has_had_cameras
+
+    if not has_had_cameras(engine):
+        _seed(engine, LOCAL)
 
 
 @cameras_app.command(name="add")

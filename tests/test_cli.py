@@ -74,6 +74,10 @@ def test_a_backup_of_nothing_says_where_it_looked_and_makes_nothing(tmp_path: Pa
     assert list(tmp_path.iterdir()) == []
 
 
+def test_help_is_asked_for_in_short_too() -> None:
+    assert at_once("cameras", "list", "-h").stdout == at_once("cameras", "list", "--help").stdout
+
+
 def test_the_version_is_the_package_s(tmp_path: Path) -> None:
     assert camind(tmp_path, "version").stdout.strip() == version("camind")
 

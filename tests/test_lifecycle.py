@@ -223,6 +223,9 @@ def test_a_new_database_is_seeded_once(tmp_path: Path, tiny_model_dir: Path) -> 
         return [item["name"] for item in json.loads(server.ask("GET", "/cameras?limit=100").body)["items"]]
 
     arguments = ("--seed", "--model", tiny_model_dir)
+    # what a first start leaves that found the disk full
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "camind.sqlite3").touch()
     with serving(tmp_path / "data", *arguments) as server:
         seeded = names(server)
         assert "nikon-d7500-50mm-f1.8" in seeded

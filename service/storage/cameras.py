@@ -164,6 +164,12 @@ def camera_counts(engine: Engine, name: str | None = None) -> dict[str, int]:
         return dict(session.exec(query.group_by(owner).order_by(owner)).all())
 
 
+def has_had_cameras(engine: Engine) -> bool:
+    """Whether anybody ever had a camera, deleted ones too."""
+    with reading(engine) as session:
+        return session.exec(select(col(CameraRow.id)).limit(1)).first() is not None
+
+
 def require_name(name: str) -> None:
     """Raise ``BadRequest`` for what is no name."""
     if not _is_name(name):
