@@ -1,6 +1,7 @@
 """Structured logs: one event a line on standard error, ours and the libraries' alike."""
 
 import logging
+import os
 import sys
 from typing import Literal
 
@@ -34,5 +35,5 @@ def _rendered(style: Literal["console", "json"]) -> list[Processor]:
     strip = structlog.stdlib.ProcessorFormatter.remove_processors_meta
     if style == "json":
         return [strip, structlog.processors.format_exc_info, structlog.processors.JSONRenderer()]
-    plain = structlog.dev.plain_traceback
-    return [strip, structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty(), exception_formatter=plain)]
+    colors = sys.stderr.isatty() and not os.environ.get("NO_COLOR")
+    return [strip, structlog.dev.ConsoleRenderer(colors=colors, exception_formatter=structlog.dev.plain_traceback)]

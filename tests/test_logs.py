@@ -1,0 +1,25 @@
+"""The log as it is shown."""
+
+import io
+import sys
+
+import pytest
+
+from service import logs
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(
+    ("shown_on", "no_color", "is_coloured"), [(Terminal, "", True), (Terminal, "1", False), (io.StringIO, "", False)]
+)
+def test_colours_are_a_terminal_s_where_they_are_wanted(
+    monkeypatch: pytest.MonkeyPatch, shown_on: type[io.StringIO], no_color: str, is_coloured: bool
+) -> None:
+    monkeypatch.setattr(sys, "stderr", shown_on())
+    monkeypatch.setenv("NO_COLOR", no_color)
+    *_, render = logs._rendered("console")
+    assert ("\x1b" in str(render(None, "info", {"event": "asked", "level": "info"}))) == is_coloured
