@@ -277,8 +277,8 @@ def bind(host: str, port: int) -> socket.socket:
         listener.listen(BACKLOG)
     except OSError as exc:
         listener.close()
-        option = "--port" if exc.errno in PORTS_FAULTS else "--host"
-        raise CannotListenError(f"Cannot listen on {host}:{port} ({exc.strerror}): choose another {option}.") from exc
+        remedy = "--port or CAMIND_PORT" if exc.errno in PORTS_FAULTS else "--host or CAMIND_HOST"
+        raise CannotListenError(f"Cannot listen on {host}:{port} ({exc.strerror}): choose another {remedy}.") from exc
     return listener
 
 
