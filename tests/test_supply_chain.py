@@ -147,11 +147,14 @@ def test_an_environment_that_was_moved_is_made_anew(tmp_path: Path, made_in: str
     assert ("is up to date" in done.stdout) != is_made_anew
 
 
-def test_a_python_too_old_is_said_before_anything_is_made(tmp_path: Path) -> None:
-    old = "import sys; sys.version_info = (3, 10, 13); exec(sys.argv[1])"
-    done = set_up(tmp_path, f"exec {sys.executable} -c '{old}' \"$2\"")
+@pytest.mark.parametrize("version", [(3, 10, 13), (3, 15, 0)])
+def test_a_python_too_old_or_too_new_is_said_before_anything_is_made(
+    tmp_path: Path, version: tuple[int, int, int]
+) -> None:
+    other = f"import sys; sys.version_info = {version}; exec(sys.argv[1])"
+    done = set_up(tmp_path, f"exec {sys.executable} -c '{other}' \"$2\"")
     assert done.returncode != 0
-    assert "\nPython 3.11 or newer: " in done.stderr
+    assert "\nPython 3.11 to 3.14: " in done.stderr
 
 
 def test_the_bill_of_materials_names_every_pin(tmp_path: Path) -> None:
