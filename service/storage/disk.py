@@ -26,13 +26,21 @@ def make_private(folder: Path) -> None:
 
 
 def try_lock(path: Path, *, is_shared: bool = False) -> BinaryIO | None:
-    """The file, made for its owner alone if it is not there, locked until it is closed; None while others hold it."""
-    file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600), "ab")
+    """The file, made for its owner alone if it is not there, locked until it is closed; None while others hold it.
+
+    Raises ``OSError``, whose message says what to do, where the disk knows no locks.
+    """
+    # on NFS who shares a lock must be able to read, who has it alone to write
+    file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600), "ab")
     try:
         fcntl.flock(file, (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         file.close()
         return None
+    except OSError as exc:
+        file.close()
+        told = f"{path} cannot be locked ({exc.strerror}): set CAMIND_DATA_DIR to a folder on this machine's own disk."
+        raise OSError(told) from exc
     return file
 
 
