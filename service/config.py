@@ -1,7 +1,6 @@
 """The settings: one frozen object, read once from ``CAMIND_*`` variables and passed in.
 
-Nothing else reads the environment, but for ``NO_COLOR`` (https://no-color.org), and nothing is read at import. A value
-out of bounds refuses to start.
+Nothing else reads the environment, and nothing is read at import. A value out of bounds refuses to start.
 """
 
 import os

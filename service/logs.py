@@ -1,11 +1,11 @@
 """Structured logs: one event a line on standard error, ours and the libraries' alike."""
 
 import logging
-import os
 import sys
 from typing import Literal
 
 import structlog
+from rich.console import Console
 from structlog.typing import Processor
 
 
@@ -35,5 +35,6 @@ def _rendered(style: Literal["console", "json"]) -> list[Processor]:
     strip = structlog.stdlib.ProcessorFormatter.remove_processors_meta
     if style == "json":
         return [strip, structlog.processors.format_exc_info, structlog.processors.JSONRenderer()]
-    colors = sys.stderr.isatty() and not os.environ.get("NO_COLOR")
+    terminal = Console(stderr=True)
+    colors = terminal.is_terminal and not terminal.no_color
     return [strip, structlog.dev.ConsoleRenderer(colors=colors, exception_formatter=structlog.dev.plain_traceback)]

@@ -21,5 +21,6 @@ def test_colours_are_a_terminal_s_where_they_are_wanted(
 ) -> None:
     monkeypatch.setattr(sys, "stderr", shown_on())
     monkeypatch.setenv("NO_COLOR", no_color)
+    monkeypatch.delenv("FORCE_COLOR", raising=False)
     *_, render = logs._rendered("console")
     assert ("\x1b" in str(render(None, "info", {"event": "asked", "level": "info"}))) == is_coloured
