@@ -1,6 +1,5 @@
 """Whole calibrations, on photographs simulated with the project's renderer; and what goes wrong with photographs."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 
