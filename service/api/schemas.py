@@ -10,7 +10,8 @@ from service.api.cursors import NextCursor
 from service.api.texts import Worded
 from service.errors import BadRequest
 from service.optics.camera import F_NUMBERS, FOCUS_DISTANCES_M, Camera, Intrinsics, Lens
-from service.storage.cameras import DEFAULT_K_R, NAME_PATTERN, CameraDraft, CameraRecord, Source
+from service.optics.thin_lens import K_R_OF_DISC
+from service.storage.cameras import NAME_PATTERN, CameraDraft, CameraRecord, Source
 
 DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 PLAIN_TEXT = r"^[^\x00-\x08\x0b\x0c\x0e-\x1f\x7f]*$"
@@ -62,7 +63,7 @@ class LensSpecs(Given):
             allow_inf_nan=False,
             description="Diameter of the circle of confusion over its standard deviation; a disc has 4",
         ),
-    ] = DEFAULT_K_R
+    ] = K_R_OF_DISC
 
     def to_domain(self) -> Lens:
         """The lens as the physics takes it."""
@@ -247,7 +248,7 @@ class LensDraft(BaseModel):
     f_number: float | None
     pixel_pitch_um: float | None
     sensor_width_px: int | None
-    k_r: float = DEFAULT_K_R
+    k_r: float = K_R_OF_DISC
 
 
 class CameraDraftRead(BaseModel):

@@ -21,7 +21,7 @@ class Lens:
     f_number: float
     pixel_pitch_um: float
     sensor_width_px: int
-    k_r: float = 4.0
+    k_r: float = thin_lens.K_R_OF_DISC
 
     @property
     def focal_length_m(self) -> float:

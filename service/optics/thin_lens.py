@@ -24,6 +24,7 @@ class Arithmetic(Protocol):
 
 
 Q = TypeVar("Q", bound=Arithmetic)
+K_R_OF_DISC = 4.0  # diameter of the circle of confusion over its standard deviation along an axis
 SHRUNK_GAMMA_PX = 0.45  # as soft as pictures are that were made small, whatever made them so
 PIXEL_BOX_VARIANCE = 1 / 12  # of a box one pixel wide, per axis, px^2
 
@@ -34,7 +35,7 @@ def k_cam(
     focus_distance_m: float,
     pixel_pitch_m: float,
     width_ratio: float = 1.0,
-    k_r: float = 4.0,
+    k_r: float = K_R_OF_DISC,
 ) -> float:
     """Blur in pixels per unit of relative defocus, from lens specs (eq. 2 and 3).
 

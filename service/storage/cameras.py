@@ -17,13 +17,13 @@ from sqlmodel.sql.expression import Select
 
 from service.errors import BadRequest, Conflict, NotFound, PreconditionFailed
 from service.optics.camera import Camera, Intrinsics, Lens
+from service.optics.thin_lens import K_R_OF_DISC
 from service.principal import LOCAL
 from service.storage.engine import again_if_beaten, reading, writing
 from service.storage.idempotency import Once, note, outcome_of
 from service.storage.tables import CameraRevisionRow, CameraRow
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
-DEFAULT_K_R = 4.0
 
 Source = Literal["given", "lens", "calibration"]
 SOURCE: TypeAdapter[Source] = TypeAdapter(Source)
@@ -42,7 +42,7 @@ class CameraDraft:
     @property
     def k_r(self) -> float:
         """Diameter of the circle of confusion over the standard deviation that k_cam stands for."""
-        return self.lens.k_r if self.lens else DEFAULT_K_R
+        return self.lens.k_r if self.lens else K_R_OF_DISC
 
     @property
     def with_focal_length(self) -> Camera:
