@@ -31,7 +31,7 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
 	const [focus, setFocus] = useState("");
 	const [job, setJob] = useState(/** @type {?any} */ (null));
 	const [recent, setRecent] = useState(/** @type {any[]} */ ([]));
-	const [problem, setProblem] = useProblem();
+	const [problem, setProblem, guard] = useProblem();
 	const [attempt, setAttempt] = useState(0);
 	const [sent, setSent] = useState(/** @type {number | null | undefined} */ (undefined));
 	const title = useRef(/** @type {?HTMLHeadingElement} */ (null));
@@ -86,19 +86,16 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
 	}
 
 	/** @param {string} id */
-	async function open(id) {
-		try {
+	const open = (id) =>
+		guard(async () => {
 			const found = await getJson(`calibrations/${id}`);
 			setJob(found);
 			move(FINAL.has(found.state) ? 3 : 2);
 			setProblem(null);
 			setAttempt((count) => count + 1);
-		} catch (error) {
-			setProblem(problemOf(error));
-		}
-	}
+		});
 
-	async function start() {
+	function start() {
 		if (isSending) return;
 		const form = new FormData();
 		const settings = { pattern: patternOf(sheet), focus_distance_m: focusM, register: false };
@@ -107,7 +104,7 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
 		requestKey.current ||= crypto.getRandomValues(new Uint32Array(4)).join("-");
 		setProblem(null);
 		setSent(0);
-		try {
+		guard(async () => {
 			const { body } = await upload(`calibrate?camera=${encodeURIComponent(name.trim())}`, {
 				body: form,
 				headers: { "Idempotency-Key": requestKey.current },
@@ -117,11 +114,7 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
 			requestKey.current = "";
 			setJob(body);
 			move(2);
-		} catch (error) {
-			setProblem(problemOf(error));
-		} finally {
-			setSent(undefined);
-		}
+		}).finally(() => setSent(undefined));
 	}
 
 	const isSending = sent !== undefined;

@@ -39,7 +39,7 @@ export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 	const [base, setBase] = useState(editing);
 	const [fields, setFields] = useState(/** @type {Fields} */ (editing ? fieldsOf(editing) : BLANK));
 	const [held, setHeld] = useState(/** @type {{k_cam_px: number, focus_distance_m: number} | null} */ (editing));
-	const [problem, setProblem] = useProblem();
+	const [problem, setProblem, guard] = useProblem();
 	const [told, setTold] = useState(/** @type {string[]} */ ([]));
 	const [theirs, setTheirs] = useState(/** @type {?any} */ (null));
 	const [isSaving, setIsSaving] = useState(false);
@@ -77,29 +77,21 @@ export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 		}
 	}
 
-	async function showTheirs() {
-		try {
-			setTheirs(await getJson(`cameras/${encodeURIComponent(base.name)}`));
-		} catch (error) {
-			setProblem(problemOf(error));
-		}
-	}
+	const showTheirs = () => guard(async () => setTheirs(await getJson(`cameras/${encodeURIComponent(base.name)}`)));
 
 	/** @param {Event} event */
 	async function fillFromPhotograph(event) {
 		const input = /** @type {HTMLInputElement} */ (event.target);
 		const file = input.files?.[0];
 		if (!file) return;
-		try {
+		await guard(async () => {
 			const headers = { "Content-Type": mediaTypeOf(file) };
 			const draft = await getJson("cameras/from-photo", { method: "POST", headers, body: file });
 			setTold(draft.warnings);
 			setFields((before) => filledIn(before, draft));
 			onTyped();
 			setProblem(null);
-		} catch (error) {
-			setProblem(problemOf(error));
-		}
+		});
 		input.value = "";
 	}
 

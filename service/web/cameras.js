@@ -1,6 +1,6 @@
 /** The cameras: listed, read with their curve and revisions, made, changed, deleted, exported and imported. */
 
-import { getJson, problemOf, request } from "./api.js";
+import { getJson, request } from "./api.js";
 import { CameraCurve } from "./camera_curve.js";
 import { ImportDialog, exportCameras } from "./camera_files.js";
 import { CameraForm, arriveAt } from "./camera_form.js";
@@ -233,19 +233,17 @@ function CameraCard({ camera, opened, go, onEdit, onDeleted, onStale }) {
 function Revisions({ path }) {
 	const [items, setItems] = useState(/** @type {any[]} */ ([]));
 	const [cursor, setCursor] = useState(/** @type {?string} */ (null));
-	const [problem, setProblem] = useProblem();
+	const [problem, setProblem, guard] = useProblem();
 
 	/** @param {?string} after */
-	async function load(after) {
+	function load(after) {
 		setCursor(null); // until the next is known
-		try {
+		guard(async () => {
 			const page = await getJson(`${path}?limit=${A_PAGE}${after ? `&cursor=${encodeURIComponent(after)}` : ""}`);
 			setItems((before) => [...(after ? before : []), ...page.items]);
 			setCursor(page.next_cursor);
 			setProblem(null);
-		} catch (error) {
-			setProblem(problemOf(error));
-		}
+		});
 	}
 
 	return html`
@@ -282,19 +280,15 @@ function changesOf(before, after) {
 /** @param {{camera: any, path: string, onClose: () => void, onDeleted: () => void, onStale: () => void}} props */
 function DeleteDialog({ camera, path, onClose, onDeleted, onStale }) {
 	const dialog = useRef(/** @type {?HTMLDialogElement} */ (null));
-	const [problem, setProblem] = useProblem();
+	const [problem, , guard] = useProblem();
 	useEffect(() => dialog.current?.showModal(), []);
 
-	async function remove() {
-		try {
+	const remove = () =>
+		guard(async () => {
 			await request(path, { method: "DELETE", headers: { "If-Match": `"${camera.revision}"` } });
-		} catch (error) {
-			setProblem(problemOf(error));
-			return;
-		}
-		dialog.current?.close();
-		onDeleted();
-	}
+			dialog.current?.close();
+			onDeleted();
+		});
 
 	return html`
 		<dialog ref=${dialog} aria-labelledby="delete-title" onClose=${onClose}>

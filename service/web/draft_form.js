@@ -20,7 +20,7 @@ const NUMBERS = [
 export function DraftForm({ file, mediaType, onStored, onFailed }) {
 	const [draft, setDraft] = useState(/** @type {any} */ (null));
 	const [fields, setFields] = useState(/** @type {import("./camera_specs.js").Fields} */ ({}));
-	const [problem, setProblem] = useProblem();
+	const [problem, setProblem, guard] = useProblem();
 	const [isStoring, setIsStoring] = useState(false);
 	const [attempt, setAttempt] = useState(0);
 
@@ -42,18 +42,12 @@ export function DraftForm({ file, mediaType, onStored, onFailed }) {
 	}, [file, attempt]);
 
 	/** @param {SubmitEvent} event */
-	async function store(event) {
+	function store(event) {
 		event.preventDefault();
 		if (isStoring) return;
 		setIsStoring(true);
 		setProblem(null);
-		try {
-			await onStored(await storeCamera(bodyOf(fields), null));
-		} catch (error) {
-			setProblem(problemOf(error));
-		} finally {
-			setIsStoring(false);
-		}
+		guard(async () => onStored(await storeCamera(bodyOf(fields), null))).finally(() => setIsStoring(false));
 	}
 
 	if (draft === null) {

@@ -1,6 +1,6 @@
 /** The answer as a file in every format, and the request for it as something to paste. */
 
-import { problemOf, readBody, readDepthHeaders, request, storedKey } from "./api.js";
+import { readBody, readDepthHeaders, request, storedKey } from "./api.js";
 import { FORMATS, answerName, curlCommand, depthPath, pythonCommand } from "./commands.js";
 import { mediaTypeOf } from "./photograph_files.js";
 import { ProblemBox, Warnings, useProblem } from "./problem_box.js";
@@ -12,28 +12,24 @@ import { html, useState } from "./vendor/preact.js";
 export function Exports({ result: { asked, file, revision, model, warnings }, announce, onChanged }) {
 	const [format, setFormat] = useState("png");
 	const [isBusy, setIsBusy] = useState(false);
-	const [problem, setProblem] = useProblem();
+	const [problem, setProblem, guard] = useProblem();
 	const [told, setTold] = useState(/** @type {string[]} */ ([]));
 	const [copied, setCopied] = useState(/** @type {{text: string, isCopied: boolean} | null} */ (null));
 	const path = depthPath({ ...asked, format });
 	const mediaType = mediaTypeOf(file);
 	const answer = answerName(file.name, format);
 
-	async function download() {
+	function download() {
 		if (isBusy) return;
 		setIsBusy(true);
 		setProblem(null);
 		setTold([]);
-		try {
+		guard(async () => {
 			const got = await ask();
 			setTold(got.told);
 			if (got.body) save(got.body, answer);
 			announce([...(got.body ? [`${answer} is downloaded`] : []), ...got.told].join(". "));
-		} catch (error) {
-			setProblem(problemOf(error));
-		} finally {
-			setIsBusy(false);
-		}
+		}).finally(() => setIsBusy(false));
 	}
 
 	/** The service keeps no photograph: it is sent again. @returns {Promise<{body: Blob | null, told: string[]}>} no body where it is another camera's or model's now */

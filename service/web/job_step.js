@@ -1,6 +1,6 @@
 /** The third and fourth step: a calibration while it runs, and what it found. */
 
-import { problemOf, request, sendJson } from "./api.js";
+import { request, sendJson } from "./api.js";
 import { intrinsicsIn } from "./camera_specs.js";
 import { Chart } from "./chart.js";
 import { counted, measure, short } from "./numbers.js";
@@ -17,16 +17,8 @@ const SPREADS = { disc: "a disc", gaussian: "a Gaussian" };
 
 /** @param {{job: any}} props */
 export function Running({ job }) {
-	const [problem, setProblem] = useProblem();
-
-	async function cancel() {
-		try {
-			await request(`calibrations/${job.id}`, { method: "DELETE" });
-		} catch (error) {
-			setProblem(problemOf(error));
-		}
-	}
-
+	const [problem, , guard] = useProblem();
+	const cancel = () => guard(() => request(`calibrations/${job.id}`, { method: "DELETE" }));
 	const percent = Math.round(job.progress * 100);
 	return html`
 		<div class="card">
@@ -221,22 +213,20 @@ function Outliers({ outliers }) {
 /** @param {Parameters<typeof Ended>[0] & {isVague: boolean}} props */
 function Accept({ job, cameras, isVague, onAccepted, onDiscard, onAgain, go }) {
 	const [name, setName] = useState(job.camera);
-	const [problem, setProblem] = useProblem();
+	const [problem, setProblem, guard] = useProblem();
 	const there = cameras?.find((camera) => camera.name === name.trim());
 	const fault = problem?.errors.find(({ pointer }) => pointer === "#/camera")?.detail ?? "";
 
 	useEffect(() => setName(job.camera), [job.id]);
 
 	/** @param {Event} event */
-	async function accept(event) {
+	function accept(event) {
 		event.preventDefault();
-		try {
+		guard(async () => {
 			const stored = await sendJson(`calibrations/${job.id}/accept`, { camera: name.trim() });
 			setProblem(null);
 			onAccepted(stored);
-		} catch (error) {
-			setProblem(problemOf(error));
-		}
+		});
 	}
 
 	if (job.camera_revision !== null) {

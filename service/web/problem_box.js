@@ -1,5 +1,6 @@
 /** What went wrong and what to do about it, and what may go wrong. */
 
+import { problemOf } from "./api.js";
 import { html, useEffect, useState } from "./vendor/preact.js";
 
 /**
@@ -38,7 +39,12 @@ export function Warnings({ texts }) {
 	</ul>`;
 }
 
-export const useProblem = () => useState(/** @type {?import("./api.js").Problem} */ (null));
+/** The problem there is, how it is set, and a guard for work that may meet one. */
+export function useProblem() {
+	const [problem, setProblem] = useState(/** @type {?import("./api.js").Problem} */ (null));
+	const guard = (/** @type {() => Promise<unknown>} */ work) => work().catch((error) => setProblem(problemOf(error)));
+	return /** @type {const} */ ([problem, setProblem, guard]);
+}
 
 /** @param {?import("./api.js").Problem} problem whose wait is counted down, in seconds */
 function useCountdown(problem) {

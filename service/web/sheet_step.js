@@ -1,6 +1,6 @@
 /** The first step: the sheet to print, and how large it came out of the printer. */
 
-import { Problem, getBlob, problemOf, storedKey } from "./api.js";
+import { Problem, getBlob, storedKey } from "./api.js";
 import { decimal, short } from "./numbers.js";
 import { ProblemBox, useProblem } from "./problem_box.js";
 import { save } from "./save.js";
@@ -61,7 +61,7 @@ export function isMeasured({ ruler_mm }) {
 /** @param {{sheet: Sheet, onChange: (sheet: Sheet) => void, onNext: () => void}} props */
 export function SheetStep({ sheet, onChange, onNext }) {
 	const { picture, problem } = usePicture(sheet);
-	const [failed, setFailed] = useProblem();
+	const [failed, setFailed, guard] = useProblem();
 	const isNone = problem?.status === 422;
 	// of glass, film or larger paper there are such sheets
 	const isElsewhere = isNone && problem.errors.some(({ pointer }) => pointer === "paper");
@@ -82,13 +82,9 @@ export function SheetStep({ sheet, onChange, onNext }) {
 	`;
 
 	/** @param {"pdf" | "svg"} kind */
-	async function download(kind) {
+	function download(kind) {
 		setFailed(null);
-		try {
-			save(await getBlob(`calibrate/target.${kind}?${queryOf(sheet)}`), `camind-sheet.${kind}`);
-		} catch (error) {
-			setFailed(problemOf(error));
-		}
+		guard(async () => save(await getBlob(`calibrate/target.${kind}?${queryOf(sheet)}`), `camind-sheet.${kind}`));
 	}
 
 	const unseen = isElsewhere

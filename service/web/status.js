@@ -1,6 +1,6 @@
 /** The view Status: whether the service can work, how busy it is, and how good its model is. */
 
-import { Problem, getBlob, getJson, getText, problemOf, storedKey } from "./api.js";
+import { Problem, getBlob, getJson, getText, storedKey } from "./api.js";
 import { ProblemBox, useProblem } from "./problem_box.js";
 import { histogramOf, readSamples, valueOf } from "./prometheus.js";
 import { save } from "./save.js";
@@ -156,17 +156,13 @@ function Readiness({ ready, samples, at, onRetry }) {
 
 /** @param {{wantsKey: boolean}} props */
 function Documents({ wantsKey }) {
-	const [failed, setFailed] = useProblem();
+	const [failed, setFailed, guard] = useProblem();
 	if (!wantsKey) {
 		return html`<p><a href="docs">API, to try out</a> · <a href="openapi.json">API as OpenAPI</a></p>`;
 	}
-	async function download() {
+	function download() {
 		setFailed(null);
-		try {
-			save(await getBlob("openapi.json"), "openapi.json");
-		} catch (error) {
-			setFailed(problemOf(error));
-		}
+		guard(async () => save(await getBlob("openapi.json"), "openapi.json"));
 	}
 	return html`
 		<div class="row"><button onClick=${download}>Download the API as OpenAPI</button></div>
