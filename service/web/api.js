@@ -37,6 +37,11 @@ export class Problem extends Error {
 		Object.assign(this, about);
 	}
 
+	/** What is wrong with a field. @param {string} place */
+	of(place) {
+		return this.errors.find(({ pointer }) => pointer === place)?.detail;
+	}
+
 	/** Whether the same request may fare better later, or with a key. */
 	get isPassing() {
 		return [0, 401, 408, 429].includes(this.status) || this.status >= 500;
@@ -271,6 +276,7 @@ function sendWithProgress(path, { method = "POST", headers = {}, body = null, si
 	return new Promise((resolve, reject) => {
 		const sent = new XMLHttpRequest();
 		const abort = () => sent.abort();
+		const tellAborted = () => reject(new DOMException("The request was aborted.", "AbortError"));
 		sent.open(method, path);
 		sent.responseType = responseType;
 		for (const [name, value] of Object.entries(headers)) sent.setRequestHeader(name, value);
@@ -284,10 +290,10 @@ function sendWithProgress(path, { method = "POST", headers = {}, body = null, si
 			resolve({ status: sent.status, headers: new Headers(pairs.filter(([name]) => name)), body: sent.response });
 		};
 		sent.onerror = () => noAnswer(body).then(reject);
-		sent.onabort = () => reject(new DOMException("The request was aborted.", "AbortError"));
+		sent.onabort = tellAborted;
 		sent.onloadend = () => signal?.removeEventListener("abort", abort);
 		signal?.addEventListener("abort", abort);
-		if (signal?.aborted) reject(new DOMException("The request was aborted.", "AbortError"));
+		if (signal?.aborted) tellAborted();
 		else sent.send(body);
 	});
 }

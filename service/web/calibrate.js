@@ -119,8 +119,8 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
 
 	const isSending = sent !== undefined;
 	const reached = job !== null ? (FINAL.has(job.state) ? 3 : 2) : 1;
-	const focusFault = problem?.errors.find(({ pointer }) => pointer === "#/settings/focus_distance_m")?.detail;
-	const nameFault = problem?.errors.find(({ pointer }) => pointer === "camera")?.detail;
+	const focusFault = problem?.of("#/settings/focus_distance_m");
+	const nameFault = problem?.of("camera");
 	return html`
 		<div class="stack">
 			<h2 tabindex="-1" ref=${title}>Calibrate<span class="visually-hidden">, step ${step + 1}: ${STEPS[step]}</span></h2>
@@ -157,13 +157,7 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
 						/>
 					</div>
 				</div>
-				<${Photographs}
-					photos=${photos}
-					query=${query}
-					focus=${focusM ?? null}
-					onChange=${setPhotos}
-					announce=${announce}
-				/>
+				<${Photographs} ...${{ photos, query, announce }} focus=${focusM ?? null} onChange=${setPhotos} />
 				<${ProblemBox} problem=${nameFault || focusFault ? null : problem} />
 				<div class="row">
 					<button
@@ -183,9 +177,7 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
 			${step === 3 &&
 			job &&
 			html`<${Ended}
-				job=${job}
-				cameras=${cameras}
-				go=${go}
+				...${{ job, cameras, go }}
 				onAccepted=${async (stored) => {
 					setJob(stored);
 					announce(`Stored as revision ${stored.camera_revision} of camera ${stored.camera}.`);

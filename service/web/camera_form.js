@@ -14,7 +14,7 @@ import {
 	refocusedKCam,
 } from "./camera_specs.js";
 import { short } from "./numbers.js";
-import { PHOTOGRAPHS, mediaTypeOf } from "./photograph_files.js";
+import { PHOTOGRAPHS, sending } from "./photograph_files.js";
 import { ProblemBox, Warnings, useProblem } from "./problem_box.js";
 import { Table } from "./table.js";
 import { TextField } from "./text_field.js";
@@ -85,8 +85,7 @@ export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 		const file = input.files?.[0];
 		if (!file) return;
 		await guard(async () => {
-			const headers = { "Content-Type": mediaTypeOf(file) };
-			const draft = await getJson("cameras/from-photo", { method: "POST", headers, body: file });
+			const draft = await getJson("cameras/from-photo", sending(file));
 			setTold(draft.warnings);
 			setFields((before) => filledIn(before, draft));
 			onTyped();

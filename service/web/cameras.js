@@ -5,9 +5,10 @@ import { CameraCurve } from "./camera_curve.js";
 import { ImportDialog, exportCameras } from "./camera_files.js";
 import { CameraForm, arriveAt } from "./camera_form.js";
 import { differences, intrinsicsIn } from "./camera_specs.js";
+import { FileButton } from "./file_choice.js";
 import { counted, short, when } from "./numbers.js";
 import { ProblemBox, useProblem } from "./problem_box.js";
-import { html, useEffect, useMemo, useRef, useState } from "./vendor/preact.js";
+import { html, useEffect, useRef, useState } from "./vendor/preact.js";
 
 const A_PAGE = 20;
 /** @type {Record<string, string>} */
@@ -24,11 +25,7 @@ export function CamerasView({ shown, cameras, lacksCameras, camera, reloadCamera
 	const [file, setFile] = useState(/** @type {?File} */ (null));
 	const [filter, setFilter] = useState("");
 	const [most, setMost] = useState(A_PAGE);
-	const importing = useRef(/** @type {?HTMLInputElement} */ (null));
-	const found = useMemo(
-		() => (cameras ?? []).filter(({ name }) => name.toLowerCase().includes(filter.toLowerCase())),
-		[cameras, filter],
-	);
+	const found = (cameras ?? []).filter(({ name }) => name.toLowerCase().includes(filter.toLowerCase()));
 	const read = open.kind === "read" ? cameras?.find(({ name }) => name === open.name) : null;
 	const edited = open.kind === "edit" ? open.camera : null;
 
@@ -87,21 +84,15 @@ export function CamerasView({ shown, cameras, lacksCameras, camera, reloadCamera
 				<h2>Cameras</h2>
 				<div class="row">
 					<button class="primary" onClick=${begin}>New camera</button>
-					<button onClick=${() => importing.current?.click()}>Import</button>
+					<${FileButton}
+						of=${{ accept: ".json,application/json", "aria-label": "Cameras to import" }}
+						onFiles=${([first]) => setFile(first ?? null)}
+					>
+						Import
+					<//>
 					<button disabled=${!cameras?.length} onClick=${() => exportCameras(cameras ?? [], "cameras")}>
 						Export all
 					</button>
-					<input
-						ref=${importing}
-						type="file"
-						accept=".json,application/json"
-						hidden
-						aria-label="Cameras to import"
-						onChange=${({ target }) => {
-							setFile(target.files[0] ?? null);
-							target.value = "";
-						}}
-					/>
 				</div>
 			</div>
 			<div class="cameras">
@@ -152,9 +143,7 @@ export function CamerasView({ shown, cameras, lacksCameras, camera, reloadCamera
 					${read &&
 					html`<${CameraCard}
 						key=${`${read.name} ${read.revision}`}
-						camera=${read}
-						opened=${open}
-						go=${go}
+						...${{ camera: read, opened: open, go }}
 						onEdit=${() => turnTo({ kind: "edit", camera: read })}
 						onDeleted=${() => changed(`Camera ${read.name} is deleted.`)}
 						onStale=${reloadCameras}
@@ -248,9 +237,7 @@ function Revisions({ path }) {
 
 	return html`
 		<details
-			onToggle=${(event) => {
-				if (/** @type {HTMLDetailsElement} */ (event.target).open && items.length === 0) load(null);
-			}}
+			onToggle=${(event) => event.target.open && items.length === 0 && load(null)}
 		>
 			<summary>Revisions</summary>
 			<${ProblemBox} problem=${problem} onRetry=${() => load(null)} />

@@ -115,10 +115,14 @@ function drawn({ kind, tone, points }, across, up) {
 	);
 }
 
+/** @template T @param {T[]} all @param {number} most @returns {T[]} evenly fewer, where they are more */
+export function thinned(all, most) {
+	const every = Math.ceil(all.length / most);
+	return all.filter((_, number) => number % every === 0);
+}
+
 /** @param {Series} one @param {Axis} x @param {Axis} y */
 function tabled({ name, kind, points }, x, y) {
-	const every = Math.ceil(points.length / MOST_ROWS);
-	const rows = points.filter((_, number) => number % every === 0);
 	const isBand = kind === "band";
 	const head = [x.label, ...(isBand ? ["Low", "High"] : [y.label])];
 	return html`<table>
@@ -127,7 +131,7 @@ function tabled({ name, kind, points }, x, y) {
 			<tr>${head.map((words, at) => html`<th scope="col" class="number">${words} (${at ? y.unit : x.unit})</th>`)}</tr>
 		</thead>
 		<tbody>
-			${rows.map((point) => {
+			${thinned(points, MOST_ROWS).map((point) => {
 				const numbers = isBand ? [point.x, point.low, point.high] : [point.x, point.y];
 				return html`<tr>${numbers.map((number) => html`<td class="number">${short(number, 4)}</td>`)}</tr>`;
 			})}

@@ -30,12 +30,6 @@ const ZOOMS = [0.05, 20];
 /** @typedef {{positions: Float32Array, colours: Uint8Array, centre: number[], spacing: number}} Points */
 
 export class Cloud {
-	/** @param {OffscreenCanvas} canvas @param {(count: number) => void} onDrawn @returns {?Cloud} null where the browser has no WebGL2 */
-	static on(canvas, onDrawn) {
-		const gl = canvas.getContext("webgl2", { antialias: false, powerPreference: "low-power" });
-		return gl && new Cloud(canvas, gl, onDrawn);
-	}
-
 	/**
 	 * @param {OffscreenCanvas} canvas
 	 * @param {WebGL2RenderingContext} gl

@@ -14,8 +14,9 @@ let cloud = null;
 
 scope.onmessage = (/** @type {MessageEvent<Order | OffscreenCanvas>} */ { data }) => {
 	if (data instanceof OffscreenCanvas) {
-		cloud = Cloud.on(data, (count) => scope.postMessage({ drawn: count }));
-		if (cloud === null) scope.postMessage({ isMissing: true });
+		const gl = data.getContext("webgl2", { antialias: false, powerPreference: "low-power" });
+		if (gl) cloud = new Cloud(data, gl, (drawn) => scope.postMessage({ drawn }));
+		else scope.postMessage({ isMissing: true });
 	} else {
 		const [method, ...about] = data;
 		/** @type {any} */ (cloud)?.[method](...about);

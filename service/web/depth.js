@@ -7,9 +7,10 @@ import { depthPath } from "./commands.js";
 import { Colours } from "./colour_controls.js";
 import { DraftForm } from "./draft_form.js";
 import { Exports } from "./exports.js";
+import { DropPlace, FileButton } from "./file_choice.js";
 import { Legend } from "./legend.js";
 import { counted, inMetres, short, toMetres, withError } from "./numbers.js";
-import { PHOTOGRAPHS, mediaTypeOf, readShown } from "./photograph_files.js";
+import { PHOTOGRAPHS, readShown, sending } from "./photograph_files.js";
 import { ProblemBox, Warnings, useProblem } from "./problem_box.js";
 import { DepthReader } from "./reader.js";
 import { Distance, Readout, Timings } from "./readout.js";
@@ -112,7 +113,7 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 		setFocusM(null);
 	}
 
-	const take = useCallback(async (/** @type {FileList | null | undefined} */ files) => {
+	const take = useCallback(async (/** @type {Iterable<File> | null | undefined} */ files) => {
 		const given = Array.from(files ?? []);
 		const taken = given.find(({ type }) => type.startsWith("image/")) ?? given[0];
 		if (!taken) return;
@@ -186,8 +187,7 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 			// a phone shows little more, and four times as much would take four times as long to come
 			const longestPx = Math.min(MOST_PX, 2 * screen.width);
 			const answer = await upload(`${depthPath({ ...ask, format: "npz" })}&longest_px=${longestPx}`, {
-				body: sent,
-				headers: { "Content-Type": mediaTypeOf(sent) },
+				...sending(sent),
 				// a Blob: it stays outside the page, and the worker takes its arrays out one by one
 				responseType: "blob",
 				signal,
@@ -297,7 +297,14 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 					/>
 					<${Warnings} texts=${warned("focus")} />
 				</div>
-				<${FileButtons} hasFile=${file !== null} onFiles=${take} />
+				<div class="row depth-files">
+					<${FileButton} class=${file ? "" : "primary"} of=${{ accept: PHOTOGRAPHS }} onFiles=${take}>
+						${file ? "Another photograph" : "Choose a photograph"}
+					<//>
+					<${FileButton} class="depth-take" of=${{ accept: "image/*", capture: "environment" }} onFiles=${take}>
+						Take one
+					<//>
+				</div>
 			</div>
 
 			<${ProblemBox}
@@ -317,7 +324,6 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 			html`<${DraftForm}
 				key=${file}
 				file=${file}
-				mediaType=${mediaTypeOf(/** @type {File} */ (file))}
 				onFailed=${setFailure}
 				onStored=${async (stored) => {
 					await reloadCameras({ stored });
@@ -337,7 +343,16 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 			</p>`}
 
 			${size === null
-				? html`<${DropPlace} ...${{ file, isOpening }} isRefused=${failure && NO_PHOTOGRAPH.test(failure.type)} />`
+				? html`<${DropPlace} kind="depth-drop">
+						<p><strong>Drop a photograph here, or paste one</strong></p>
+						<p class="hint">
+							${file
+								? isOpening
+									? "Opening it ..."
+									: `This browser cannot show it; the service ${failure && NO_PHOTOGRAPH.test(failure.type) ? "cannot read it either" : "may still read it"}.`
+								: "The whole frame as the camera stored it: a crop has lost its scale. It is read, and not kept."}
+						</p>
+					<//>`
 				: html`<div class=${`depth-grid ${phase && result ? "depth-stale" : ""}`}>
 						<div class="stack">
 							${failure &&
@@ -353,9 +368,8 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 								...${result && { role: "tabpanel", "aria-labelledby": "depth-tab-photograph", hidden: picture !== "photograph" }}
 							>
 								<${Stage}
-									...${{ reader, size, look, reading, marks, measured, known, announce }}
+									...${{ reader, size, look, result, reading, marks, measured, known, announce }}
 									bitmap=${photograph?.bitmap ?? null}
-									result=${result}
 									onReading=${setReading}
 									onMarks=${setMarks}
 									onCounts=${setCounts}
@@ -398,7 +412,7 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 	`;
 }
 
-/** Photographs dropped on the view, or pasted. @param {boolean} shown @param {(files: FileList | null | undefined) => void} take */
+/** Photographs dropped on the view, or pasted. @param {boolean} shown @param {(files?: FileList) => void} take */
 function useFilesFromOutside(shown, take) {
 	useEffect(() => {
 		if (!shown) return undefined;
@@ -408,44 +422,6 @@ function useFilesFromOutside(shown, take) {
 		document.addEventListener("paste", ({ clipboardData }) => take(clipboardData?.files), { signal });
 		return () => end.abort();
 	}, [shown]);
-}
-
-/** @param {{file: File | null, isOpening: boolean, isRefused: boolean | null}} props */
-function DropPlace({ file, isOpening, isRefused }) {
-	const [isOver, setIsOver] = useState(false);
-	return html`<div
-		class=${`drop depth-drop ${isOver ? "over" : ""}`}
-		onDragEnter=${() => setIsOver(true)}
-		onDragLeave=${() => setIsOver(false)}
-		onDrop=${() => setIsOver(false)}
-	>
-		<p><strong>Drop a photograph here, or paste one</strong></p>
-		<p class="hint">
-			${file
-				? isOpening
-					? "Opening it ..."
-					: `This browser cannot show it; the service ${isRefused ? "cannot read it either" : "may still read it"}.`
-				: "The whole frame as the camera stored it: a crop has lost its scale. It is read, and not kept."}
-		</p>
-	</div>`;
-}
-
-/** @param {{hasFile: boolean, onFiles: (files: FileList) => void}} props */
-function FileButtons({ hasFile, onFiles }) {
-	const chosen = useRef(/** @type {?HTMLInputElement} */ (null));
-	const taken = useRef(/** @type {?HTMLInputElement} */ (null));
-	const onChange = (/** @type {any} */ { target }) => {
-		onFiles(target.files);
-		target.value = ""; // the same file may be chosen again
-	};
-	return html`<div class="row depth-files">
-		<button class=${hasFile ? "" : "primary"} onClick=${() => chosen.current?.click()}>
-			${hasFile ? "Another photograph" : "Choose a photograph"}
-		</button>
-		<button class="depth-take" onClick=${() => taken.current?.click()}>Take one</button>
-		<input ref=${chosen} type="file" accept=${PHOTOGRAPHS} hidden onChange=${onChange} />
-		<input ref=${taken} type="file" accept="image/*" capture="environment" hidden onChange=${onChange} />
-	</div>`;
 }
 
 /** @param {{picture: string, onPicture: (picture: string) => void}} props */

@@ -1,9 +1,10 @@
 /** A camera drafted by the service from a photograph's EXIF, to be completed and stored. */
 
-import { problemOf, storeCamera, upload } from "./api.js";
+import { getJson, problemOf, storeCamera } from "./api.js";
 import { Field } from "./camera_form.js";
 import { SENSOR_WIDTH, bodyOf, fieldsOf, missingOf } from "./camera_specs.js";
 import { decimal } from "./numbers.js";
+import { sending } from "./photograph_files.js";
 import { ProblemBox, Warnings, useProblem } from "./problem_box.js";
 import { html, useEffect, useState } from "./vendor/preact.js";
 
@@ -15,9 +16,9 @@ const NUMBERS = [
 	["lens/sensor_width_px", "Sensor width (px)", SENSOR_WIDTH],
 ];
 
-/** @param {{file: File, mediaType: string, onStored: (camera: any) => Promise<void>,
+/** @param {{file: File, onStored: (camera: any) => Promise<void>,
  *   onFailed: (why: import("./api.js").Problem) => void}} props */
-export function DraftForm({ file, mediaType, onStored, onFailed }) {
+export function DraftForm({ file, onStored, onFailed }) {
 	const [draft, setDraft] = useState(/** @type {any} */ (null));
 	const [fields, setFields] = useState(/** @type {import("./camera_specs.js").Fields} */ ({}));
 	const [problem, setProblem, guard] = useProblem();
@@ -27,11 +28,10 @@ export function DraftForm({ file, mediaType, onStored, onFailed }) {
 	useEffect(() => {
 		const abort = new AbortController();
 		setProblem(null);
-		const headers = { "Content-Type": mediaType };
-		upload("cameras/from-photo", { body: file, headers, signal: abort.signal, responseType: "json" })
-			.then(({ body }) => {
-				setDraft(body);
-				setFields(fieldsOf(body));
+		getJson("cameras/from-photo", { ...sending(file), signal: abort.signal })
+			.then((drafted) => {
+				setDraft(drafted);
+				setFields(fieldsOf(drafted));
 			})
 			.catch((error) => {
 				if (abort.signal.aborted) return;

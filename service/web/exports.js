@@ -2,7 +2,7 @@
 
 import { readBody, readDepthHeaders, request, storedKey } from "./api.js";
 import { FORMATS, answerName, curlCommand, depthPath, pythonCommand } from "./commands.js";
-import { mediaTypeOf } from "./photograph_files.js";
+import { mediaTypeOf, sending } from "./photograph_files.js";
 import { ProblemBox, Warnings, useProblem } from "./problem_box.js";
 import { save } from "./save.js";
 import { Choice } from "./text_field.js";
@@ -34,7 +34,7 @@ export function Exports({ result: { asked, file, revision, model, warnings }, an
 
 	/** The service keeps no photograph: it is sent again. @returns {Promise<{body: Blob | null, told: string[]}>} no body where it is another camera's or model's now */
 	async function ask() {
-		const reply = await request(path, { method: "POST", body: file, headers: { "Content-Type": mediaType } });
+		const reply = await request(path, sending(file));
 		const now = readDepthHeaders(reply.headers);
 		if (now.revision !== revision || now.model !== model) {
 			reply.body?.cancel();

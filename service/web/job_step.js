@@ -2,7 +2,7 @@
 
 import { request, sendJson } from "./api.js";
 import { intrinsicsIn } from "./camera_specs.js";
-import { Chart } from "./chart.js";
+import { Chart, thinned } from "./chart.js";
 import { counted, measure, short } from "./numbers.js";
 import { ProblemBox, Warnings, useProblem } from "./problem_box.js";
 import { Table } from "./table.js";
@@ -137,21 +137,17 @@ function Constant({ name, unit, of: { value, low, high } }) {
 /** @param {any} sample */
 const told = (sample) => `${sample.image}, circle ${sample.circle}`;
 
-/** @param {any[]} samples evenly fewer, where they are very many */
-function thinned(samples) {
-	const every = Math.ceil(samples.length / MOST_DOTS);
-	return samples.filter((_, number) => number % every === 0);
-}
+/** @typedef {{samples: any[], curve: any[], focus_distance_m: any}} Result */
 
-/** @param {{result: any}} props */
+/** @param {{result: Result}} props */
 function Fit({ result: { samples, curve, focus_distance_m: focus } }) {
 	const dots = (/** @type {boolean} */ used) =>
-		thinned(samples.filter((/** @type {any} */ sample) => sample.used === used)).map((/** @type {any} */ sample) => ({
+		thinned(samples.filter((sample) => sample.used === used), MOST_DOTS).map((sample) => ({
 			x: sample.depth_m,
 			y: sample.blur_px,
 			label: told(sample),
 		}));
-	const along = curve.map((/** @type {any} */ at) => ({ x: at.depth_m, y: at.blur_px, low: at.low_px, high: at.high_px }));
+	const along = curve.map((at) => ({ x: at.depth_m, y: at.blur_px, low: at.low_px, high: at.high_px }));
 	return html`<${Chart}
 		title="Blur of every circle"
 		x=${{ label: "distance", unit: "m", isLog: true }}
@@ -166,10 +162,10 @@ function Fit({ result: { samples, curve, focus_distance_m: focus } }) {
 	/>`;
 }
 
-/** @param {{result: any}} props */
+/** @param {{result: Result}} props */
 function Residuals({ result: { samples, curve } }) {
-	const used = thinned(samples.filter((/** @type {any} */ sample) => sample.used));
-	const points = used.flatMap((/** @type {any} */ sample) => {
+	const used = thinned(samples.filter((sample) => sample.used), MOST_DOTS);
+	const points = used.flatMap((sample) => {
 		const fitted = curveAt(curve, sample.depth_m);
 		return fitted === null ? [] : [{ x: sample.depth_m, y: sample.blur_px - fitted, label: told(sample) }];
 	});
@@ -215,7 +211,7 @@ function Accept({ job, cameras, isVague, onAccepted, onDiscard, onAgain, go }) {
 	const [name, setName] = useState(job.camera);
 	const [problem, setProblem, guard] = useProblem();
 	const there = cameras?.find((camera) => camera.name === name.trim());
-	const fault = problem?.errors.find(({ pointer }) => pointer === "#/camera")?.detail ?? "";
+	const fault = problem?.of("#/camera") ?? "";
 
 	useEffect(() => setName(job.camera), [job.id]);
 

@@ -2,9 +2,10 @@
 
 import { Problem, getJson, problemOf } from "./api.js";
 import { Chart } from "./chart.js";
+import { DropPlace, FileButton } from "./file_choice.js";
 import { WANTED, adviceFor, coverageOf, focusOf } from "./guidance.js";
 import { counted, measure } from "./numbers.js";
-import { PHOTOGRAPHS, mediaTypeOf, readShown, upright } from "./photograph_files.js";
+import { PHOTOGRAPHS, readShown, sending, upright } from "./photograph_files.js";
 import { html, useEffect, useRef, useState } from "./vendor/preact.js";
 
 const THUMB_PX = 320;
@@ -63,8 +64,7 @@ export function useLooks(photos, setPhotos, query) {
 async function lookAt(file, query, asks, signal) {
 	for (;;) {
 		try {
-			const headers = { "Content-Type": mediaTypeOf(file) };
-			return await getJson(`calibrate/look?${query}`, { method: "POST", headers, body: file, asks, signal });
+			return await getJson(`calibrate/look?${query}`, { ...sending(file), asks, signal });
 		} catch (error) {
 			if (!(error instanceof Problem && error.retryAfterS)) throw error;
 			const waitMs = error.retryAfterS * 1000;
@@ -103,7 +103,16 @@ export function Photographs({ photos, query, focus, onChange, announce }) {
 
 	return html`
 		<div class="columns">
-			${ROLES.map((one) => html`<${DropZone} key=${one.role} ...${one} onFiles=${(files) => add(files, one.role)} />`)}
+			${ROLES.map(({ role, title, words }) => {
+				const onFiles = (/** @type {File[]} */ files) => add(files, role);
+				const of = { multiple: true, accept: PHOTOGRAPHS, "data-role": role, "aria-label": title };
+				return html`<${DropPlace} key=${role} onFiles=${onFiles}>
+					<h3>${title}</h3>
+					<p class="hint">${words}</p>
+					<${FileButton} aria-label=${`Choose photographs: ${title}`} ...${{ of, onFiles }}>Choose photographs<//>
+					<span class="hint">or drop them here</span>
+				<//>`;
+			})}
 		</div>
 		<div class="notice next">
 			<p>
@@ -147,41 +156,6 @@ function hasPartner(photo, photos) {
 	return place >= 0 && Boolean(photos.filter(({ role }) => role === "focused")[place]?.look?.found);
 }
 
-/** @param {{role: Role, title: string, words: string, onFiles: (files: File[]) => void}} props */
-function DropZone({ role, title, words, onFiles }) {
-	const input = useRef(/** @type {?HTMLInputElement} */ (null));
-	const [isOver, setIsOver] = useState(false);
-	return html`
-		<div
-			class=${`drop ${isOver ? "over" : ""}`}
-			onDragOver=${() => setIsOver(true)}
-			onDragLeave=${() => setIsOver(false)}
-			onDrop=${({ dataTransfer }) => {
-				setIsOver(false);
-				onFiles([...dataTransfer.files]);
-			}}
-		>
-			<h3>${title}</h3>
-			<p class="hint">${words}</p>
-			<button aria-label=${`Choose photographs: ${title}`} onClick=${() => input.current?.click()}>Choose photographs</button>
-			<span class="hint">or drop them here</span>
-			<input
-				ref=${input}
-				type="file"
-				multiple
-				hidden
-				accept=${PHOTOGRAPHS}
-				data-role=${role}
-				aria-label=${title}
-				onChange=${() => {
-					onFiles([...(input.current?.files ?? [])]);
-					if (input.current) input.current.value = "";
-				}}
-			/>
-		</div>
-	`;
-}
-
 /** @param {{photo: Photo, isLooking: boolean, hasPartner: boolean, onRole: (role: Role) => void, onAgain: () => void, onRemove: () => void}} props */
 function PhotoCard({ photo, isLooking, hasPartner: partner, onRole, onAgain, onRemove }) {
 	const { file, look, problem, role } = photo;
@@ -210,7 +184,7 @@ function PhotoCard({ photo, isLooking, hasPartner: partner, onRole, onAgain, onR
 				<select
 					aria-label=${`How ${file.name} was focused`}
 					value=${role}
-					onChange=${(event) => onRole(/** @type {Role} */ (event.target.value))}
+					onChange=${(event) => onRole(event.target.value)}
 				>
 					${ROLES.map((one) => html`<option value=${one.role}>${one.title}</option>`)}
 				</select>

@@ -10,6 +10,11 @@ export function mediaTypeOf(file) {
 	return file.type.startsWith("image/") ? file.type : "application/octet-stream";
 }
 
+/** The request that sends one. @param {File} file */
+export function sending(file) {
+	return { method: "POST", headers: { "Content-Type": mediaTypeOf(file) }, body: file };
+}
+
 /**
  * What `read` makes of a photograph, or of the service's JPEG of one that the browser does not show.
  *
@@ -21,7 +26,7 @@ export function mediaTypeOf(file) {
 export async function readShown(file, longestPx, read) {
 	const found = await read(file);
 	if (found !== null) return found;
-	const about = { method: "POST", headers: { "Content-Type": mediaTypeOf(file) }, body: file, asks: false };
+	const about = { ...sending(file), asks: false };
 	const preview = await getBlob(`photographs/preview?longest_px=${longestPx}`, about).catch(() => null);
 	return preview && read(preview);
 }

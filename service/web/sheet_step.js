@@ -64,10 +64,10 @@ export function SheetStep({ sheet, onChange, onNext }) {
 	const [failed, setFailed, guard] = useProblem();
 	const isNone = problem?.status === 422;
 	// of glass, film or larger paper there are such sheets
-	const isElsewhere = isNone && problem.errors.some(({ pointer }) => pointer === "paper");
+	const isElsewhere = isNone && problem.of("paper") !== undefined;
 	const printed = patternOf(sheet);
 	const hasScale = isMeasured(sheet);
-	const fault = (/** @type {string} */ name) => problem?.errors.find(({ pointer }) => pointer === name)?.detail ?? "";
+	const fault = (/** @type {string} */ name) => problem?.of(name) ?? "";
 
 	const field = (/** @type {keyof Sheet} */ name, /** @type {string} */ label, words = "") => html`
 		<${TextField}

@@ -154,12 +154,9 @@ export function Stage(props) {
 			class=${`depth-stage ${result ? "depth-ready" : ""}`}
 			style=${{ aspectRatio: `${size.width} / ${size.height}`, maxWidth: `calc(78vh * ${size.width / size.height})` }}
 			...${result && { tabindex: 0, role: "application", "aria-label": "Depth of the photograph", "aria-describedby": HINT }}
-			onPointerDown=${onPointerDown}
-			onPointerMove=${onPointerMove}
-			onPointerUp=${onPointerUp}
+			...${{ onPointerDown, onPointerMove, onPointerUp, onKeyDown }}
 			onPointerLeave=${(event) =>
 				event.pointerType === "mouse" && !isByKeys.current && result && read(marks.at(-1) ?? null)}
-			onKeyDown=${onKeyDown}
 		>
 			<${Bitmap} bitmap=${bitmap} name="photograph" />
 			<div class="depth-over" style=${{ clipPath: `inset(0 0 0 ${portion})` }} hidden=${painted === null}>

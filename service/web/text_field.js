@@ -12,14 +12,11 @@ export function TextField({ id, label, value, onInput, fault = "", hint, onChang
 		<div class="field">
 			<label for=${id}>${label}</label>
 			<input
-				id=${id}
 				type="text"
+				...${{ id, list, value, disabled }}
 				inputmode=${kind}
-				list=${list}
 				autocomplete="off"
 				spellcheck=${false}
-				value=${value}
-				disabled=${disabled}
 				aria-invalid=${invalid}
 				aria-describedby=${`${id}-told`}
 				onInput=${(event) => onInput(event.target.value)}
