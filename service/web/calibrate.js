@@ -39,7 +39,7 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
 	const requestKey = useRef("");
 	const known = cameras?.find((one) => one.name === name.trim()) ?? null;
 	const focusM = toMetres(focus);
-	const about = new URLSearchParams(Object.entries(patternOf(sheet)).map(([field, value]) => [field, String(value)]));
+	const about = new URLSearchParams(/** @type {any} */ (patternOf(sheet)));
 	if (known) about.set("camera", known.name);
 	const query = isMeasured(sheet) ? String(about) : "";
 

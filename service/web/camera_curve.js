@@ -8,7 +8,6 @@ import { html } from "./vendor/preact.js";
 /** @param {{camera: any, points: any[] | null}} props `camera` as the API reads or previews it */
 export function CameraCurve({ camera, points }) {
 	const range = usableM(camera);
-	const far = range?.[1] ?? 0;
 	return html`
 		<dl class="figures">
 			<div><dt>k_cam</dt><dd>${short(camera.k_cam_px, 4)} <small>px</small></dd></div>
@@ -25,7 +24,7 @@ export function CameraCurve({ camera, points }) {
 			y=${{ label: "blur", unit: "px", from: 0 }}
 			marks=${[
 				{ x: camera.focus_distance_m, label: "in focus" },
-				{ x: far, label: "range ends" },
+				{ x: range?.[1] ?? 0, label: "range ends" },
 			].filter(({ x }) => x < points.at(-1).depth_m && x > points[0].depth_m)}
 			series=${[
 				{ name: "", kind: "line", tone: "one", points: points.map((point) => ({ x: point.depth_m, y: point.blur_px })) },

@@ -21,9 +21,9 @@ export function ImportDialog({ file, onClose }) {
 	const [steps, setSteps] = useState(/** @type {Step[] | null} */ (null));
 	const [fault, setFault] = useState("");
 	const [isBusy, setIsBusy] = useState(false);
-	const wanted = (steps ?? []).filter(({ does }) => does === "create" || does === "update");
-	const stored = (steps ?? []).filter(({ does }) => does === "done").length;
-	const failed = (steps ?? []).filter(({ does }) => does === "refuse").length;
+	const those = (/** @type {Step["does"][]} */ ...what) => (steps ?? []).filter(({ does }) => what.includes(does));
+	const wanted = those("create", "update");
+	const stored = those("done").length;
 
 	useEffect(() => {
 		dialog.current?.showModal();
@@ -62,7 +62,7 @@ export function ImportDialog({ file, onClose }) {
 					<button onClick=${() => dialog.current?.close()}>${stored > 0 ? "Close" : "Cancel"}</button>
 					<span role="status">
 						${steps
-							? wanted.length === 0 && `${counted(stored, "camera is", "cameras are")} stored, ${failed} refused`
+							? wanted.length === 0 && `${counted(stored, "camera is", "cameras are")} stored, ${those("refuse").length} refused`
 							: !fault && `Reading ${file.name} ...`}
 					</span>
 				</div>

@@ -64,8 +64,7 @@ export function fieldsOf(camera) {
 	const fill = (/** @type {string} */ path, /** @type {unknown} */ value) => {
 		if (value !== null && value !== undefined) fields[path] = String(value);
 	};
-	const plain = ["name", "description", "image_width_px", "image_height_px", "focus_distance_m", "gamma_px"];
-	for (const name of plain) fill(name, camera[name]);
+	for (const name of ["name", "description", ...Object.keys(NEEDED), "gamma_px"]) fill(name, camera[name]);
 	if (camera.lens) for (const name of LENS) fill(`lens/${name}`, camera.lens[name]);
 	else for (const name of K_CAM) fill(name, camera[name]);
 	if (camera.intrinsics) {

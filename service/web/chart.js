@@ -9,7 +9,7 @@ const HEIGHT = 280;
 const LEFT = 64;
 const RIGHT = 14;
 const TOP = 14;
-const BOTTOM = 46;
+const FLOOR = HEIGHT - 46; // where the axis of x is
 const LINE = 16; // so that two words never run into each other
 const LETTER = 7; // as wide as one may be
 const MOST_ROWS = 30;
@@ -30,11 +30,12 @@ const TICK_DIGITS = 6; // they are round, and of a narrow range differ in the la
 /** @param {{title: string, x: Axis, y: Axis, series: Series[], marks?: {x: number, label: string}[]}} props `marks` are upright lines with a word */
 export function Chart({ title, x, y, series, marks = [] }) {
 	const [box, width] = useWidth(480);
+	const right = width - RIGHT;
 	const points = series.flatMap((one) => one.points);
 	if (points.length === 0) return null;
-	const across = scaleOf(x, [...points.map((point) => point.x), ...marks.map((mark) => mark.x)], LEFT, width - RIGHT);
+	const across = scaleOf(x, [...points.map((point) => point.x), ...marks.map((mark) => mark.x)], LEFT, right);
 	const heights = points.flatMap(({ y: at, low = at, high = at }) => [at, low, high]);
-	const up = scaleOf(y, heights, HEIGHT - BOTTOM, TOP);
+	const up = scaleOf(y, heights, FLOOR, TOP);
 	const named = series.filter(({ name }) => name);
 	return html`
 		<figure class="chart" ref=${box}>
@@ -48,29 +49,29 @@ export function Chart({ title, x, y, series, marks = [] }) {
 			<svg role="img" aria-label=${title} viewBox=${`0 0 ${width} ${HEIGHT}`} width=${width} height=${HEIGHT}>
 				${up.ticks.map(
 					(tick) => html`<g key=${tick}>
-						<line class="grid" x1=${LEFT} x2=${width - RIGHT} y1=${up.scale(tick)} y2=${up.scale(tick)} />
+						<line class="grid" x1=${LEFT} x2=${right} y1=${up.scale(tick)} y2=${up.scale(tick)} />
 						<text x=${LEFT - 6} y=${up.scale(tick) + 4} text-anchor="end">${short(tick, TICK_DIGITS)}</text>
 					</g>`,
 				)}
 				${across.ticks.map(
 					(tick) => html`<g key=${tick}>
-						<line class="tick" x1=${across.scale(tick)} x2=${across.scale(tick)} y1=${HEIGHT - BOTTOM} y2=${HEIGHT - BOTTOM + 5} />
-						<text x=${across.scale(tick)} y=${HEIGHT - BOTTOM + 19} text-anchor="middle">${short(tick, TICK_DIGITS)}</text>
+						<line class="tick" x1=${across.scale(tick)} x2=${across.scale(tick)} y1=${FLOOR} y2=${FLOOR + 5} />
+						<text x=${across.scale(tick)} y=${FLOOR + 19} text-anchor="middle">${short(tick, TICK_DIGITS)}</text>
 					</g>`,
 				)}
-				<line class="axis" x1=${LEFT} x2=${width - RIGHT} y1=${HEIGHT - BOTTOM} y2=${HEIGHT - BOTTOM} />
+				<line class="axis" x1=${LEFT} x2=${right} y1=${FLOOR} y2=${FLOOR} />
 				${marks.map((mark, row) => {
 					const at = across.scale(mark.x);
 					const isLeft = marks.length > 1 ? marks.every(({ x }) => x >= mark.x) : at > width / 2;
-					const room = isLeft ? at - LEFT : width - RIGHT - at;
+					const room = isLeft ? at - LEFT : right - at;
 					const [aside, anchor] = isLeft === room > mark.label.length * LETTER ? [-5, "end"] : [5, "start"];
 					return html`<g class="mark">
-						<line x1=${at} x2=${at} y1=${TOP} y2=${HEIGHT - BOTTOM} />
+						<line x1=${at} x2=${at} y1=${TOP} y2=${FLOOR} />
 						<text x=${at + aside} y=${TOP + 10 + row * LINE} text-anchor=${anchor}>${mark.label}</text>
 					</g>`;
 				})}
 				${series.map((one) => drawn(one, across.scale, up.scale))}
-				<text x=${width - RIGHT} y=${HEIGHT - 6} text-anchor="end">${x.label} (${x.unit})</text>
+				<text x=${right} y=${HEIGHT - 6} text-anchor="end">${x.label} (${x.unit})</text>
 				<text x=${12} y=${TOP} transform=${`rotate(-90 12 ${TOP})`} text-anchor="end">
 					${y.label} (${y.unit})
 				</text>

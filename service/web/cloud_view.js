@@ -116,8 +116,6 @@ function drawOn(canvas, onMissing) {
 
 /** Size, pointers, wheel and keys for the view. @param {HTMLCanvasElement} canvas @param {Tell} tell @returns {() => void} what ends it */
 function handle(canvas, tell) {
-	const orbit = (/** @type {number} */ right, /** @type {number} */ down) => tell(["orbit", right, down]);
-	const zoom = (/** @type {number} */ factor) => tell(["zoom", factor]);
 	const sized = new ResizeObserver(([{ contentRect }]) => {
 		const dense = Math.min(MOST_DENSE, devicePixelRatio);
 		const [width, height] = [contentRect.width, contentRect.height].map((length) => Math.round(length * dense));
@@ -142,15 +140,15 @@ function handle(canvas, tell) {
 		if (!before) return;
 		const wasApart = pointers.size === 2 ? apart() : 0;
 		pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
-		if (pointers.size === 2) zoom(apart() / wasApart);
-		else orbit((event.clientX - before.x) / canvas.clientHeight, (event.clientY - before.y) / canvas.clientHeight);
+		if (pointers.size === 2) tell(["zoom", apart() / wasApart]);
+		else tell(["orbit", (event.clientX - before.x) / canvas.clientHeight, (event.clientY - before.y) / canvas.clientHeight]);
 	});
 	for (const name of /** @type {const} */ (["pointerup", "pointercancel"])) {
 		on(name, (event) => pointers.delete(event.pointerId));
 	}
 	on("wheel", (event) => {
 		event.preventDefault();
-		zoom(Math.exp(-event.deltaY / 500));
+		tell(["zoom", Math.exp(-event.deltaY / 500)]);
 	});
 	on("keydown", (event) => {
 		if (!(event.key in KEYS) || event.altKey || event.ctrlKey || event.metaKey) return;

@@ -19,9 +19,6 @@ import { Tape } from "./tape.js";
 import { Choice, TextField } from "./text_field.js";
 import { html, useCallback, useEffect, useMemo, useRef, useState } from "./vendor/preact.js";
 
-/** @typedef {import("./maps.js").Facts} Facts */
-/** @typedef {import("./maps.js").Look} Look */
-/** @typedef {import("./maps.js").Reading} Reading */
 /** @typedef {{u: number, v: number}} Pixel */
 /** @typedef {import("./tape.js").KnownDepth} KnownDepth */
 
@@ -29,7 +26,7 @@ import { html, useCallback, useEffect, useMemo, useRef, useState } from "./vendo
  * @typedef {object} Result
  * @property {{camera: string, side: string, focusM: number | null, known: KnownDepth[]}} asked
  * @property {File} file
- * @property {Facts} facts
+ * @property {import("./maps.js").Facts} facts
  * @property {number} focusM the focus distance that was used
  * @property {number} revision of the camera
  * @property {string[]} warnings
@@ -56,7 +53,7 @@ const MANY = 10; // cameras are searched
 const SETTLED_MS = 300;
 const NOT_THE_FRAME = "urn:camind:problem:image-size-mismatch";
 const NO_PHOTOGRAPH = /:(invalid-image|unsupported-kind)$/;
-/** @type {Look} */
+/** @type {import("./maps.js").Look} */
 const FIRST_LOOK = { map: "cividis", nearM: 1, farM: 2, hatchesNothing: true, dotsEither: true };
 
 /** @param {import("./app.js").ViewProps} props */
@@ -82,7 +79,7 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 	const [result, setResult] = useState(/** @type {?Result} */ (null));
 	const [look, setLook] = useState(FIRST_LOOK);
 	const [isOpening, setIsOpening] = useState(false);
-	const [reading, setReading] = useState(/** @type {?Reading} */ (null));
+	const [reading, setReading] = useState(/** @type {?import("./maps.js").Reading} */ (null));
 	const [marks, setMarks] = useState(/** @type {Pixel[]} */ ([]));
 	const [picture, setPicture] = useState("photograph");
 	const [counts, setCounts] = useState(/** @type {Uint32Array | null} */ (null));
@@ -307,11 +304,7 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 				</div>
 			</div>
 
-			<${ProblemBox}
-				problem=${problem}
-				onRetry=${file && camera ? again : undefined}
-				onClose=${() => setProblem(null)}
-			/>
+			<${ProblemBox} problem=${problem} onRetry=${file && camera ? again : undefined} onClose=${() => setProblem(null)} />
 			${isNotTheFrame &&
 			cameras &&
 			!isDrafting &&

@@ -38,7 +38,7 @@ const FARTHER = [1.25, 1.7];
  * @returns {number[][]} rows of columns
  */
 export function coverageOf(seen) {
-	const orientation = seen[seen.length - 1]?.orientation ?? 1;
+	const orientation = seen.at(-1)?.orientation ?? 1;
 	const isTurned = orientation > 4;
 	const [rows, columns] = isTurned ? [COLUMNS, ROWS] : [ROWS, COLUMNS];
 	const cells = Array.from({ length: rows }, () => Array(columns).fill(0));

@@ -3,8 +3,6 @@
 import { colourTable, placeOf } from "./colours.js";
 import { readNpz } from "./npy.js";
 
-/** @typedef {import("./colours.js").MapName} MapName */
-
 /**
  * What is known at a pixel; null where there is no answer, or no other hypothesis.
  *
@@ -32,7 +30,7 @@ import { readNpz } from "./npy.js";
 
 /**
  * @typedef {object} Look
- * @property {MapName} map
+ * @property {import("./colours.js").MapName} map
  * @property {number} nearM
  * @property {number} farM
  * @property {boolean} hatchesNothing whether pixels without an answer are hatched
@@ -262,11 +260,10 @@ export class DepthMaps {
 				count++;
 			}
 		}
-		const middle = (/** @type {number} */ axis) => medianOf(positions, axis, count);
 		return {
 			positions: positions.slice(0, 3 * count),
 			colours: colours.slice(0, 3 * count),
-			centre: count > 0 ? [middle(0), middle(1), middle(2)] : [0, 0, 1],
+			centre: count > 0 ? [0, 1, 2].map((axis) => medianOf(positions, axis, count)) : [0, 0, 1],
 			spacing: (step * across) / this.lens.fx,
 		};
 	}

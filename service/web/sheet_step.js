@@ -135,9 +135,8 @@ export function SheetStep({ sheet, onChange, onNext }) {
 }
 
 /** @param {Sheet} sheet */
-function queryOf({ kind, rows, columns, spacing_mm, diameter_mm, paper }) {
-	const numbers = Object.entries({ rows, columns, spacing_mm, diameter_mm });
-	return new URLSearchParams([["kind", kind], ["paper", paper], ...numbers.map(([name, text]) => [name, text.replace(",", ".")])]);
+function queryOf({ ruler_mm: _, ...asked }) {
+	return new URLSearchParams(Object.entries(asked).map(([name, text]) => [name, text.replace(",", ".")]));
 }
 
 /** @param {Sheet} sheet @returns {{picture: string | null, problem: Problem | null}} */

@@ -33,9 +33,9 @@ const HINT = "depth-stage-hint";
  *   announce: (text: string) => void,
  * }} props
  */
-export function Stage(props) {
-	const { reader, size, look, bitmap, result, reading, marks, measured, known } = props;
-	const { onReading, onMarks, onCounts, announce } = props;
+export function Stage({
+	reader, size, look, bitmap, result, reading, marks, measured, known, onReading, onMarks, onCounts, announce,
+}) {
 	const [stage, width] = useWidth(0);
 	const [divider, setDivider] = useState(0);
 	const [painted, setPainted] = useState(/** @type {?ImageBitmap} */ (null));

@@ -110,13 +110,10 @@ async function lookedAt(before, signal) {
 		isModelKnown || isRefused(before.model)
 			? before.model
 			: await orProblem(getJson("model", { signal, asks: before.at === null }));
-	const samples = isRefused(before.samples) ? before.samples : await orProblem(getSamples(signal));
+	const samples = isRefused(before.samples)
+		? before.samples
+		: await orProblem(getText("metrics", { signal, asks: false }).then(readSamples));
 	return { ready, model, samples, key: storedKey(), at: new Date() };
-}
-
-/** @param {AbortSignal} signal */
-async function getSamples(signal) {
-	return readSamples(await getText("metrics", { signal, asks: false }));
 }
 
 /** @template T @param {Promise<T>} asked @returns {Promise<T | Problem | null>} null where it was aborted */
