@@ -236,9 +236,7 @@ function Revisions({ path }) {
 	}
 
 	return html`
-		<details
-			onToggle=${(event) => event.target.open && items.length === 0 && load(null)}
-		>
+		<details onToggle=${(event) => event.target.open && items.length === 0 && load(null)}>
 			<summary>Revisions</summary>
 			<${ProblemBox} problem=${problem} onRetry=${() => load(null)} />
 			<ol class="revisions">
