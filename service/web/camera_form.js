@@ -161,7 +161,7 @@ export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 					</div>`
 				: html`<div class="pair">
 						${field("k_cam_px", "k_cam (px)", { hint: "blur per unit of relative defocus, at the image width" })}
-						${field("f_number", "f-number", { hint: "k_cam holds at" })}
+						${field("f_number", "f-number", { hint: "of the photographs that this k_cam is of, if you know it" })}
 					</div>`}
 			${held &&
 			refocused &&
