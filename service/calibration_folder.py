@@ -13,7 +13,7 @@ from service.calibration.report import PictureReport, Report, Role
 from service.errors import InvalidImage
 from service.file_names import name_column, print_table, shown
 from service.inference.images import SUFFIXES, ImageLimits, photographs_in, read_stored_frame
-from service.optics.metres import in_words
+from service.metres import in_words
 
 REPORT = TypeAdapter(Report)
 

@@ -22,7 +22,7 @@ from service.inference.cancellation import Cancellation
 from service.inference.estimator import Estimator
 from service.inference.images import SUFFIXES, ImageLimits, photographs_in
 from service.memory import keep_freed_memory
-from service.optics.metres import in_words
+from service.metres import in_words
 from service.storage.cameras import CameraRecord
 
 ENDINGS = {"preview": ".jpg"}  # of the others it is their name

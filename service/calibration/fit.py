@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
+from service.metres import in_words
 from service.optics import thin_lens
-from service.optics.metres import in_words
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from service.calibration.report import Result
-from service.optics.metres import in_words
+from service.metres import in_words
 
 INCHES = (13.0, 4.6)
 BLUE, ORANGE, GREY = "#1f5fa8", "#d9730d", "#8a8a8a"

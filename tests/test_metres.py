@@ -2,7 +2,7 @@
 
 import pytest
 
-from service.optics.metres import in_words
+from service.metres import in_words
 
 
 @pytest.mark.parametrize(
