@@ -61,10 +61,10 @@ def fit_focus(camera: Camera, sightings: Sequence[Sighting], is_near: bool | Non
     """The focus distance whose blur (eq. 3 and 5) is near to what was read, and that is near to the camera's own.
 
     It is the mean of what is likely, gamma the likeliest for it. Blur is in pixels of the camera's pictures. A known
-    depth tells its side of focus, so that, other than depth from blur, this has one answer; from a single sighting close
-    to focus the interval holds both, unless it is told whether all of the picture ``is_near``, nearer than what is in
-    focus, or beyond it. Neither end of it is farther from the camera's own than 2.5 times. Raises ``ValueError`` without
-    a sighting.
+    depth tells its side of focus, so that, other than depth from blur, this has one answer; from a single sighting
+    close to focus the interval holds both, unless it is told whether all of the picture ``is_near``, nearer than what
+    is in focus, or beyond it. Neither end is farther from the camera's own than 2.5 times. Raises ``ValueError``
+    without a sighting.
     """
     if not sightings:
         raise ValueError("a focus distance is fitted to one known depth or more")
