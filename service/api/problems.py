@@ -141,7 +141,7 @@ EXAMPLES: dict[str, tuple[str, tuple[FieldProblem, ...]]] = {
         "image/tiff, application/x-ply, image/jpeg, application/json.",
         (),
     ),
-    "receive-timeout": ("The request body did not arrive within 30 s.", ()),
+    "receive-timeout": ("The request body came too slowly: less than 32 kB/s for 30 s.", ()),
     "busy": ("17 requests run or wait, with room for no more: try again later.", ()),
     "not-ready": ("The database cannot be used: the service's log says why.", ()),
     "insufficient-storage": (
