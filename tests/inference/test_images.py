@@ -124,11 +124,63 @@ def test_ten_to_fourteen_bits_in_a_file_of_sixteen_are_no_dark_picture(kind: str
     assert read_photograph(encoded(kind, np.full_like(ramp, 255))).rgb.max() == 16  # a lens cap's
 
 
-def test_grey_becomes_rgb_and_alpha_is_dropped() -> None:
+def test_grey_becomes_rgb() -> None:
     grey = np.full((10, 12), 77, np.uint8)
     np.testing.assert_array_equal(read_photograph(encoded(".png", grey)).rgb[3, 3], (77, 77, 77))
-    clear = np.dstack([corners(), np.zeros((48, 64), np.uint8)])
-    np.testing.assert_array_equal(read_photograph(encoded(".png", clear)).rgb, corners())
+
+
+def half_transparent(kind: str, dtype: type[np.uint8 | np.uint16]) -> bytes:
+    """``corners()`` whose upper half is two thirds transparent."""
+    most = int(np.iinfo(dtype).max)
+    alpha = np.full((48, 64, 1), most, np.dtype(dtype))
+    alpha[:24] = most // 3
+    rgba = np.dstack([corners().astype(dtype) * (most // 255), alpha])
+    if kind == ".avif":
+        body = BytesIO()
+        Image.fromarray(rgba).save(body, "AVIF", quality=95, subsampling="4:4:4", speed=10)
+        return body.getvalue()
+    lossless = (cv2.IMWRITE_WEBP_QUALITY, 101) if kind == ".webp" else ()
+    data = encoded(kind, rgba, *lossless)
+    return tiff_with(data, {338: (3, 1, 2)}) if kind == ".tiff" else data
+
+
+@pytest.mark.parametrize(
+    ("kind", "dtype"),
+    [(".png", np.uint8), (".png", np.uint16), (".webp", np.uint8), (".tiff", np.uint16), (".avif", np.uint8)],
+)
+def test_what_is_transparent_is_hidden(kind: str, dtype: type[np.uint8 | np.uint16]) -> None:
+    photograph = read_photograph(half_transparent(kind, dtype))
+    assert photograph.hidden is not None
+    assert photograph.hidden[:24].all()
+    assert not photograph.hidden[24:].any()
+    assert np.abs(photograph.rgb.astype(int) - corners()).max() < (20 if kind == ".avif" else 1)
+
+
+def test_alpha_that_hides_nothing_or_all_of_it_says_nothing() -> None:
+    for rgba in (np.dstack([corners(), np.full((48, 64), alpha, np.uint8)]) for alpha in (0, 200, 255)):
+        photograph = read_photograph(encoded(".png", rgba))
+        assert photograph.hidden is None
+        np.testing.assert_array_equal(photograph.rgb, corners())
+
+
+def test_what_is_transparent_is_turned_along_and_not_overexposed() -> None:
+    rgba = np.dstack([np.full((48, 64, 3), 255, np.uint8), np.zeros((48, 64), np.uint8)])
+    rgba[:, :16] = (90, 90, 90, 255)
+    photograph = read_photograph(png(rgba, orientation=6))
+    assert photograph.hidden is not None
+    assert not photograph.hidden[:16].any()
+    assert photograph.hidden[16:].all()
+    assert photograph.warnings == ()
+
+
+@pytest.mark.parametrize(("transparency", "is_hidden"), [(3, True), (bytes([255]), False)])
+def test_a_palette_s_transparent_colours_are_hidden(transparency: int | bytes, *, is_hidden: bool) -> None:
+    out = BytesIO()
+    picture = Image.fromarray(corners()).quantize(4)
+    picture.save(out, "PNG", transparency=transparency)
+    hidden = read_photograph(out.getvalue()).hidden
+    assert (hidden is not None) == is_hidden
+    assert hidden is None or hidden.sum() == (np.asarray(picture) == 3).sum()
 
 
 @pytest.mark.parametrize("kept", [0.05, 0.5, 0.9, 0.99])
