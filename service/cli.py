@@ -77,8 +77,8 @@ def serve(
 ) -> None:
     """Answer requests until stopped. Everything else is set by CAMIND_* variables.
 
-    Exit codes: 0 after SIGTERM, SIGINT or SIGHUP, once what was asked is answered; 143 or 130 where a second one did
-    not wait for that; 1 where it cannot start (the address, the model, the database); 2 for a wrong setting.
+    Exit codes: 0 after SIGTERM, SIGINT or SIGHUP, once what was asked is answered; 143, 130 or 129 where a second one
+    did not wait for that; 1 where it cannot start (the address, the model, the database); 2 for a wrong setting.
     """
     _end_in_order(0)
     settings = _settings(host=host, port=port, model_dir=model)
