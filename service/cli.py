@@ -650,6 +650,8 @@ def _plain_failures() -> Iterator[None]:
     try:
         yield
     except SQLAlchemyError as exc:
+        if isinstance(exc.__context__, SystemExit):
+            raise exc.__context__ from None  # a signal came amid a statement, which is not the database's fault
         raise _failure(f"The database cannot be used: {_reason(exc)}") from exc
     except BrokenPipeError:
         raise  # whoever read what is printed has enough
