@@ -145,7 +145,7 @@ EXAMPLES: dict[str, tuple[str, tuple[FieldProblem, ...]]] = {
     "busy": ("17 requests run or wait, with room for no more: try again later.", ()),
     "not-ready": ("The database cannot be used: the service's log says why.", ()),
     "insufficient-storage": (
-        "The database's disk is full and nothing was stored: try again when there is room.",
+        "The database's disk is full and nothing was changed: even to delete takes some room.",
         (),
     ),
     "internal-error": ("Something went wrong here; the log has it under this X-Request-Id.", ()),

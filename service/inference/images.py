@@ -138,8 +138,8 @@ def photographs_in(folder: Path) -> list[Path]:
 def read_photograph(data: bytes, media_type: str | None = None, limits: ImageLimits | None = None) -> Photograph:
     """Decode a photograph; the bytes decide its kind, whatever ``media_type`` declares.
 
-    Raises ``InvalidImage`` (empty, cut off, damaged), ``TooLarge`` (before decoding) and ``UnsupportedKind``
-    (a declared type or bytes that are not listed).
+    Raises ``InvalidImage`` (empty, cut off, damaged), ``TooLarge`` (before decoding), ``UnsupportedKind``
+    (a declared type or bytes that are not listed) and ``MemoryError``.
     """
     declared = declared_kind(media_type)
     header, stored, hidden, warnings = _read(data, limits or ImageLimits())
@@ -223,6 +223,8 @@ def _decode(data: bytes, header: Header) -> tuple[NDArray[np.uint8], Mask | None
     try:
         pixels = cv2.imdecode(np.frombuffer(_picture(data, header), np.uint8), flags)
     except cv2.error as exc:
+        if exc.code == cv2.Error.StsNoMem:
+            raise MemoryError(exc.err) from exc
         raise InvalidImage(f"The {header.kind} file cannot be decoded: it is damaged.") from exc
     if pixels is None or pixels.shape[:2] != (header.height_px, header.width_px):
         raise InvalidImage(f"The {header.kind} file cannot be decoded: it is damaged or of an unusual form.")

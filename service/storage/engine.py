@@ -181,7 +181,9 @@ def _translated() -> Iterator[None]:
 def _unavailable(error: DatabaseError) -> CamindError:
     primary, state = getattr(error.orig, "sqlite_errorcode", 0) & 0xFF, getattr(error.orig, "sqlstate", None)
     if primary == sqlite3.SQLITE_FULL or state == POSTGRESQL_DISK_FULL:
-        return InsufficientStorage("The database's disk is full and nothing was stored: try again when there is room.")
+        return InsufficientStorage(
+            "The database's disk is full and nothing was changed: even to delete takes some room."
+        )
     if primary in SQLITE_DAMAGED:
         return NotReady("The database is damaged: stop the service, and `camind restore` a backup.")
     if primary == sqlite3.SQLITE_READONLY or state == POSTGRESQL_READ_ONLY:

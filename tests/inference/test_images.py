@@ -2,6 +2,8 @@
 
 import resource
 import struct
+import subprocess
+import sys
 import time
 import zlib
 from collections.abc import Callable
@@ -42,6 +44,29 @@ MAKERS: dict[str, Callable[..., bytes]] = {"jpeg": jpeg, "png": png, "tiff": tif
 UPRIGHT = {1: "rgbw", 2: "grwb", 3: "wbgr", 4: "bwrg", 5: "rbgw", 6: "brwg", 7: "wgbr", 8: "gwrb"}
 COLOURS = {"r": (255, 0, 0), "g": (0, 255, 0), "b": (0, 0, 255), "w": (255, 255, 255)}
 FOCAL, APERTURE = 0x920A, 0x829D
+
+IN_LITTLE_MEMORY = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from service.inference.artifact import load_model_folder
+from service.inference.cancellation import Cancellation
+from service.inference.images import read_photograph
+from service.inference.session import Graph
+from tests.inference.photographs import jpeg
+
+folder = load_model_folder(Path(sys.argv[1]))
+graph = Graph(folder.blur_graph, folder.manifest.graphs.blur, 1)
+data = jpeg(np.zeros((3000, 4000, 3), np.uint8))
+feeds = {name: np.zeros((1, 3, 2000, 2000), np.float32) for name in graph.input_names}
+size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (size + 2_000_000, resource.RLIM_INFINITY))
+for what, work in (("decoding", lambda: read_photograph(data)), ("running", lambda: graph.run(feeds, Cancellation()))):
+    try:
+        work()
+    except MemoryError:
+        print(what)
+"""
 
 
 @pytest.mark.parametrize("orientation", TURNS)
@@ -161,6 +186,12 @@ def test_alpha_that_hides_nothing_or_all_of_it_says_nothing() -> None:
         photograph = read_photograph(encoded(".png", rgba))
         assert photograph.hidden is None
         np.testing.assert_array_equal(photograph.rgb, corners())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="others do not bound memory")
+def test_too_little_memory_is_no_damage_to_a_file_or_a_graph(tiny_model_dir: Path) -> None:
+    done = subprocess.run([sys.executable, "-c", IN_LITTLE_MEMORY, tiny_model_dir], check=False, capture_output=True)
+    assert done.stdout.split() == [b"decoding", b"running"], done.stderr
 
 
 def test_what_is_transparent_is_turned_along_and_not_overexposed() -> None:
