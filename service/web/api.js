@@ -4,6 +4,8 @@
  * Paths are relative to the page ("cameras"), so that it works behind a prefix.
  */
 
+import { keep, kept } from "./tab_store.js";
+
 const KEY = "camind-api-key";
 /** What the window hears when another key is used, or none. */
 export const KEY_CHANGED = "camind:key";
@@ -54,13 +56,7 @@ export function problemOf(error) {
 	throw error;
 }
 
-/** @type {?string} */
-let held = null;
-try {
-	held = sessionStorage.getItem(KEY);
-} catch {
-	// a browser that stores nothing for a page still shows it
-}
+let held = kept(KEY);
 
 /** @returns {?string} the API key of this tab */
 export const storedKey = () => held;
@@ -68,12 +64,7 @@ export const storedKey = () => held;
 /** @param {?string} key */
 function holdKey(key) {
 	held = key;
-	try {
-		if (key === null) sessionStorage.removeItem(KEY);
-		else sessionStorage.setItem(KEY, key);
-	} catch {
-		// it is held until the page is left
-	}
+	keep(KEY, key);
 	dispatchEvent(new Event(KEY_CHANGED));
 }
 

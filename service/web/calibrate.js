@@ -6,11 +6,13 @@ import { toMetres, when } from "./numbers.js";
 import { Photographs, useLooks } from "./photo_step.js";
 import { ProblemBox, useProblem } from "./problem_box.js";
 import { SHEET, SheetStep, isMeasured, patternOf } from "./sheet_step.js";
+import { keep, kept } from "./tab_store.js";
 import { Table } from "./table.js";
 import { TextField } from "./text_field.js";
 import { html, useEffect, useRef, useState } from "./vendor/preact.js";
 
 const STEPS = ["Sheet", "Photographs", "Calibration", "Result"];
+const KEPT = "camind-sheet";
 const RECENT = 10;
 const AGAIN_MS = 1000;
 const FINAL = new Set(["succeeded", "failed", "cancelled"]);
@@ -25,7 +27,7 @@ const stay = (event) => event.preventDefault();
 /** @param {import("./app.js").ViewProps} props */
 export function CalibrateView({ shown, cameras, camera, reloadCameras, go, announce }) {
 	const [step, setStep] = useState(0);
-	const [sheet, setSheet] = useState(SHEET);
+	const [sheet, setSheet] = useState(() => ({ ...SHEET, ...JSON.parse(kept(KEPT) ?? "{}") }));
 	const [photos, setPhotos] = useState(/** @type {Photo[]} */ ([]));
 	const [name, setName] = useState("");
 	const [focus, setFocus] = useState("");
@@ -60,6 +62,7 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
 	useEffect(() => {
 		(isHeld ? addEventListener : removeEventListener)("beforeunload", stay);
 	}, [isHeld]);
+	useEffect(() => keep(KEPT, JSON.stringify(sheet)), [sheet]);
 	useEffect(() => {
 		if (hasMoved.current) title.current?.focus();
 	}, [step]);

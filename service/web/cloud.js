@@ -126,7 +126,7 @@ export class Cloud {
 		for (let column = 0; column < 4; column++) {
 			gl.vertexAttrib4fv(TO_CLIP + column, matrix.subarray(4 * column, 4 * column + 4));
 		}
-		gl.vertexAttrib1f(PIXELS_AT_ONE, (points.spacing * height) / (2 * HALF_VIEW));
+		gl.vertexAttrib1f(PIXELS_AT_ONE, (points.spacing * Math.min(width, height)) / (2 * HALF_VIEW));
 		gl.drawArrays(gl.POINTS, 0, points.positions.length / 3);
 		this.onDrawn(points.positions.length / 3);
 	}
@@ -151,7 +151,7 @@ export class Cloud {
 		shift[2] -= distance;
 		const [near, far] = [distance / 100, distance * 100];
 		const deep = [(far + near) / (near - far), (2 * far * near) / (near - far)];
-		const [across, up] = [1 / (HALF_VIEW * Math.max(aspect, 0.1)), 1 / HALF_VIEW];
+		const [across, up] = [1 / (HALF_VIEW * Math.max(aspect, 1)), Math.min(aspect, 1) / HALF_VIEW];
 		const columns = [0, 1, 2].flatMap((axis) => [
 			across * turn[0][axis],
 			up * turn[1][axis],

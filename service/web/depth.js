@@ -85,7 +85,7 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 	const [counts, setCounts] = useState(/** @type {Uint32Array | null} */ (null));
 	const [measured, setMeasured] = useState(/** @type {?Measured} */ (null));
 	const running = useRef(/** @type {?AbortController} */ (null));
-	const newest = useRef(/** @type {?File} */ (null));
+	const opening = useRef(/** @type {?AbortController} */ (null));
 	/** The pixel that is read, or else marked: of the next answer it is read, too. */
 	const kept = useRef(/** @type {?Pixel} */ (null));
 	kept.current = reading ?? marks.at(-1) ?? null;
@@ -121,24 +121,24 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 		setReading(null);
 		setMarks([]);
 		setKnown([]);
-		if (newest.current !== null) {
+		if (opening.current !== null) {
+			opening.current.abort();
 			setSide("auto");
 			forgetFocus();
-		}
+		} else setFocusM(toMetres(focus) ?? null); // who pastes may not have left the field
 		setPhotograph(null);
 		setIsOpening(true);
 		setIsDrafting(false);
 		setFile(taken);
-		newest.current = taken;
 		running.current = null;
-		const isNewest = () => newest.current === taken;
-		const found = await readShown(taken, MOST_PX, async (shown) =>
-			isNewest() ? reader.ask("photograph", { file: shown, mostPx: MOST_PX }).catch(() => null) : null,
-		);
-		if (!isNewest()) return;
+		const { signal } = (opening.current = new AbortController());
+		const open = async (/** @type {Blob} */ shown) =>
+			signal.aborted ? null : reader.ask("photograph", { file: shown, mostPx: MOST_PX }).catch(() => null);
+		const found = await readShown(taken, MOST_PX, open, signal);
+		if (signal.aborted) return;
 		setPhotograph(found);
 		setIsOpening(false);
-	}, []);
+	}, [focus]);
 
 	useFilesFromOutside(shown, take);
 
@@ -182,7 +182,8 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 		let isHeld = true; // the answer before
 		try {
 			// a phone shows little more, and four times as much would take four times as long to come
-			const longestPx = Math.min(MOST_PX, 2 * screen.width);
+			const isSlow = /[23]g/.test(/** @type {any} */ (navigator).connection?.effectiveType);
+			const longestPx = Math.min(MOST_PX, 2 * screen.width) / (isSlow ? 2 : 1);
 			const answer = await upload(`${depthPath({ ...ask, format: "npz" })}&longest_px=${longestPx}`, {
 				...sending(sent),
 				// a Blob: it stays outside the page, and the worker takes its arrays out one by one
@@ -414,7 +415,7 @@ function useFilesFromOutside(shown, take) {
 		document.addEventListener("drop", ({ dataTransfer }) => take(dataTransfer?.files), { signal });
 		document.addEventListener("paste", ({ clipboardData }) => take(clipboardData?.files), { signal });
 		return () => end.abort();
-	}, [shown]);
+	}, [shown, take]);
 }
 
 /** @param {{picture: string, onPicture: (picture: string) => void}} props */

@@ -212,17 +212,18 @@ function Thumb({ file, look }) {
 	const [bitmap, setBitmap] = useState(/** @type {?ImageBitmap} */ (null));
 	useEffect(() => {
 		let made = /** @type {?ImageBitmap} */ (null);
-		let isGone = false;
+		const stop = new AbortController();
+		const { signal } = stop;
+		const small = (/** @type {Blob} */ shown) =>
+			createImageBitmap(shown, { resizeWidth: THUMB_PX, resizeQuality: "medium" }).catch(() => null);
 		before = before.then(async () => {
-			if (isGone) return;
-			made = await readShown(file, THUMB_PX, (shown) =>
-				createImageBitmap(shown, { resizeWidth: THUMB_PX, resizeQuality: "medium" }).catch(() => null),
-			);
-			if (isGone) made?.close();
+			if (signal.aborted) return;
+			made = await readShown(file, THUMB_PX, small, signal);
+			if (signal.aborted) made?.close();
 			else setBitmap(made);
 		});
 		return () => {
-			isGone = true;
+			stop.abort();
 			made?.close();
 		};
 	}, [file]);

@@ -22,11 +22,12 @@ export function sending(file) {
  * @param {File} file
  * @param {number} longestPx
  * @param {(shown: Blob) => Promise<T | null>} read
+ * @param {AbortSignal} signal
  */
-export async function readShown(file, longestPx, read) {
+export async function readShown(file, longestPx, read, signal) {
 	const found = await read(file);
 	if (found !== null) return found;
-	const about = { ...sending(file), asks: false };
+	const about = { ...sending(file), asks: false, signal };
 	const preview = await getBlob(`photographs/preview?longest_px=${longestPx}`, about).catch(() => null);
 	return preview && read(preview);
 }

@@ -118,6 +118,9 @@ export function Stage({
 		mark(pixelAt(event));
 	}
 
+	/** What was marked is read again: the pointer has left, or what began as one was a finger that scrolls. */
+	const leave = () => result && read(marks.at(-1) ?? null);
+
 	/** @param {Pixel} pixel a third one begins anew */
 	function mark(pixel) {
 		onMarks(marks.length === 1 ? [marks[0], pixel] : [pixel]);
@@ -155,8 +158,8 @@ export function Stage({
 			style=${{ aspectRatio: `${size.width} / ${size.height}`, maxWidth: `calc(78vh * ${size.width / size.height})` }}
 			...${result && { tabindex: 0, role: "application", "aria-label": "Depth of the photograph", "aria-describedby": HINT }}
 			...${{ onPointerDown, onPointerMove, onPointerUp, onKeyDown }}
-			onPointerLeave=${(event) =>
-				event.pointerType === "mouse" && !isByKeys.current && result && read(marks.at(-1) ?? null)}
+			onPointerCancel=${leave}
+			onPointerLeave=${(event) => event.pointerType === "mouse" && !isByKeys.current && leave()}
 		>
 			<${Bitmap} bitmap=${bitmap} name="photograph" />
 			<div class="depth-over" style=${{ clipPath: `inset(0 0 0 ${portion})` }} hidden=${painted === null}>
@@ -220,10 +223,12 @@ function Marks({ size, reading, marks, measured, known }) {
 			)}
 			${known.map((one) => ring(one, 4, "line depth-taped"))} ${marks.map((one) => ring(one, 6, "line"))}
 			${reading &&
-			html`<g class="depth-cross">
-				<line class="rim" x1="0" y1=${y(reading.v)} x2="100%" y2=${y(reading.v)} />
-				<line class="rim" x1=${x(reading.u)} y1="0" x2=${x(reading.u)} y2="100%" />
-			</g>`}
+			["rim", "line"].map(
+				(kind) => html`<g key=${kind} class="depth-cross">
+					<line class=${kind} x1="0" y1=${y(reading.v)} x2="100%" y2=${y(reading.v)} />
+					<line class=${kind} x1=${x(reading.u)} y1="0" x2=${x(reading.u)} y2="100%" />
+				</g>`,
+			)}
 		</svg>
 		${reading &&
 		html`<${Label}

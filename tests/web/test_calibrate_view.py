@@ -90,6 +90,8 @@ def test_the_sheet_is_what_the_service_prints(page: Page, served: Server, expect
     expect(page.get_by_label("Spacing (mm)")).to_have_accessible_description(re.compile("touch"))
     expect(page.get_by_text("There is no such sheet.")).to_be_visible()
     expect(page.get_by_role("button", name="Next: photographs")).to_be_disabled()
+    page.reload()  # as a phone does with a page that was long behind its camera
+    expect(page.get_by_label("Measure this")).to_have_value("98,6")
 
 
 def test_a_sheet_too_fine_to_print_here_is_calibrated_with(page: Page, expected_errors: list[str]) -> None:
@@ -108,10 +110,13 @@ def test_a_photograph_that_browsers_do_not_show_is_shown_with_its_circles(
     page: Page, photographs: list[Path], tmp_path: Path, name: str
 ) -> None:
     pixels = np.asarray(cv2.imread(str(photographs[0]), cv2.IMREAD_COLOR_RGB), np.uint8)
-    scan = tmp_path / "scan.tiff"
-    scan.write_bytes(tiff(pixels))
+    stuck, scan = tmp_path / "stuck.tiff", tmp_path / "scan.tiff"
+    for path in (stuck, scan):
+        path.write_bytes(tiff(pixels))
     to_photographs(page, name)
-    drop(page, scan)
+    unanswered: list[Route] = []
+    page.route("**/photographs/preview?*", lambda route: route.continue_() if unanswered else unanswered.append(route))
+    drop(page, stuck, scan)
     shown = page.get_by_role("img", name="scan.tiff with 21 circles found")
     expect(shown).to_be_visible()
     expected = cv2.resize(pixels, (320, 240), interpolation=cv2.INTER_AREA).mean(2)
@@ -120,6 +125,11 @@ def test_a_photograph_that_browsers_do_not_show_is_shown_with_its_circles(
         drawn = np.array(shown.evaluate(GREY))
         return bool(drawn.size == expected.size and np.corrcoef(drawn, expected.ravel())[0, 1] > 0.9)
 
+    expect(page.get_by_role("list", name="Photographs").get_by_text("found", exact=True)).to_have_count(
+        2, timeout=LONG_MS
+    )
+    assert not is_like_it()
+    page.get_by_role("button", name="Remove stuck.tiff").click()
     eventually(page, is_like_it)
 
 

@@ -165,6 +165,25 @@ def shown_pixel(page: Page) -> tuple[int, int]:
     return int(u), int(v)
 
 
+def shot(place: Locator) -> Float:
+    pixels = cv2.imdecode(np.frombuffer(place.screenshot(), np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert pixels is not None
+    return pixels.astype(np.float32)
+
+
+def scroll(page: Page, over: Locator) -> None:
+    """Move the page by a finger that begins on something."""
+    over.evaluate("(one) => one.addEventListener('pointercancel', () => (window.isScrolled = true))")
+    box = over.bounding_box()
+    assert box is not None
+    x, y = box["x"] + 0.3 * box["width"], box["y"] + 0.9 * box["height"]
+    fingers = page.context.new_cdp_session(page)
+    for kind, moved in (("Start", 0), ("Move", 10), ("Move", 30), ("Move", 60), ("Move", 90)):
+        fingers.send("Input.dispatchTouchEvent", {"type": f"touch{kind}", "touchPoints": [{"x": x, "y": y - moved}]})
+    fingers.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    page.wait_for_function("window.isScrolled")
+
+
 def tasks_ms(trace: bytes) -> Float:
     """Processor time of each thing the page's main thread did without a pause, its waiting for one not counted."""
     events = json.loads(trace)["traceEvents"]
@@ -378,6 +397,8 @@ def test_keys_alone_read_and_measure(measured: Page, maps: Callable[..., Any]) -
             expect(measured.locator("[data-value=pixel]")).not_to_have_text(before)
     u, v = shown_pixel(measured)
     assert (u, v) == (323 - 33, 217)
+    for kind, colour in (("rim", "rgba(0, 0, 0, 0.75)"), ("line", "rgb(255, 255, 255)")):
+        expect(measured.locator(f".depth-cross .{kind}").first).to_have_css("stroke", colour)  # seen on any colour
     assert number_in(measured, "depth") == pytest.approx(known["depth_m"][v, u], abs=0.0006)
     said = measured.get_by_role("status")
     expect(said).to_contain_text(f"{known['depth_m'][v, u]:.3f} metres")
@@ -570,8 +591,10 @@ def test_what_is_marked_stays_read_and_is_printed_with_its_scale(measured: Page)
 def test_the_side_may_be_told_before_the_photograph(opened: Page) -> None:
     choose(opened)
     opened.get_by_role("combobox", name="Side of the plane in focus").select_option("far")
-    with opened.expect_request(re.compile(r"/depth\?camera=d200&side=far&format=npz&longest_px=1600$")):
-        give(opened)
+    opened.get_by_label("Focus distance of this shot").press_sequentially("1,8")  # and not left before one pastes
+    asked = r"/depth\?camera=d200&side=far&focus_distance_m=1.8&format=npz&longest_px=1600$"
+    with opened.expect_request(re.compile(asked)):
+        give(opened, kind="paste")
     stage(opened)
 
 
@@ -709,7 +732,11 @@ def test_a_file_that_was_changed_since_it_was_chosen_is_told(
 def test_progress_has_room_on_a_phone(opened: Page) -> None:
     opened.set_viewport_size({"width": 360, "height": 740})
     choose(opened)
-    give(opened)
+    line = opened.context.new_cdp_session(opened)
+    slow = {"offline": False, "latency": 300, "downloadThroughput": -1, "uploadThroughput": -1}
+    line.send("Network.emulateNetworkConditions", slow)
+    with opened.expect_request(re.compile(r"&longest_px=360$")):  # on a slow line a quarter of what comes else
+        give(opened)
     room = opened.evaluate(ROOM)
     assert room["bar"] > 40
     assert room["words"] <= room["button"]
@@ -792,9 +819,13 @@ def test_a_phone_takes_the_photograph_and_fingers_read_it(
             across, down = shown_pixel(page)
             assert number_in(page, "depth") == pytest.approx(known["depth_m"][down, across], abs=0.0006)
         expect(page.locator("[data-value=distance]")).to_be_visible()
+        scroll(page, picture)
+        eventually(page, partial(is_read, 520, 180))  # what was marked, not where the finger began
         page.get_by_role("tab", name="3D").tap()
         cloud = page.get_by_role("application", name="Points in space")
         expect(cloud).to_have_attribute("data-points", str(int(known["valid"].sum())), timeout=READY_MS)
+        eventually(page, lambda: shot(cloud).std() > 5)
+        assert shot(cloud)[:, (0, -1)].std() < 1  # all of it is seen in a narrow picture, too
 
 
 def test_without_webgl_the_page_says_so(served: Server, d200: dict[str, Any], browser: Browser) -> None:

@@ -30,6 +30,8 @@ NO_STORAGE = """Object.defineProperty(window, "sessionStorage", {
   get() { throw new DOMException("The operation is insecure.", "SecurityError"); },
 });"""
 LINE_COLOUR = "(element) => getComputedStyle(element).borderBottomColor"
+NARROWEST = """() => Math.min(...[...document.querySelectorAll(".facts dd")]
+  .filter((one) => one.checkVisibility()).map((one) => one.clientWidth))"""
 
 
 @dataclass(frozen=True)
@@ -140,6 +142,12 @@ def test_nothing_keeps_people_out(page: Page, barriers: Callable[[Page], list[st
         assert barriers(page) == [], scheme
     page.set_viewport_size({"width": 360, "height": 640})
     assert page.evaluate(OVERFLOW) <= 0
+    page.context.new_cdp_session(page).send("Page.setFontSizes", {"fontSizes": {"standard": 32}})
+    expect(page.locator("html")).to_have_css("font-size", "30px")
+    assert page.evaluate(OVERFLOW) <= 0
+    fields = page.locator(".field > :is(input, select)").filter(visible=True).all()
+    assert all(field.evaluate("(one) => getComputedStyle(one).fontSize") == "30px" for field in fields)
+    assert page.evaluate(NARROWEST) > 150
 
 
 def test_status_tells_what_the_service_tells(page: Page, served: Server) -> None:
