@@ -52,7 +52,7 @@ const MOST_PX = 1600;
 const MANY = 10; // cameras are searched
 const SETTLED_MS = 300;
 const NOT_THE_FRAME = "urn:camind:problem:image-size-mismatch";
-const NO_PHOTOGRAPH = /:(invalid-image|unsupported-kind)$/;
+const NO_PHOTOGRAPH = /:(invalid-image|unsupported-kind|too-large)$/;
 /** @type {import("./maps.js").Look} */
 const FIRST_LOOK = { map: "cividis", nearM: 1, farM: 2, hatchesNothing: true, dotsEither: true };
 

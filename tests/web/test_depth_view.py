@@ -1076,6 +1076,8 @@ def test_a_photograph_of_too_many_pixels_is_told_the_size_that_would_do(
         expect(problem.get_by_role("button", name="Try again")).to_have_count(0)
         pixels = cv2.imread(str(PHOTOGRAPH))
         assert pixels is not None
+        give(page, photographs.tiff(pixels.astype(np.uint8)))
+        expect(page.get_by_text("the service cannot read it either")).to_be_visible()
         give(page, cv2.imencode(".jpg", cv2.resize(pixels, (386, 258)))[1].tobytes())
         stage(page)
 
