@@ -77,8 +77,8 @@ def fulfil(cancellation: Cancellation, order: Order, estimator: Estimator) -> An
     for u, v in order.query.points:
         pixel_at(u, v, part)
     known = order.query.known_depths
-    is_refocused = order.query.focus_distance_m is not None or bool(known)
-    taken = taken_otherwise(photograph.exif, camera, is_refocused=is_refocused)
+    is_refocused = order.query.focus_distance_m is not None
+    taken = taken_otherwise(photograph.exif, camera, is_refocused=is_refocused, is_found=bool(known))
     registered = order.record.camera
     specs = (*maybe_of_another_size(registered), *maybe_wrong_specs(order.record.draft.lens, registered))
     shown = maybe_another_part(photograph.exif, camera)

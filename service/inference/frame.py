@@ -11,6 +11,7 @@ from service.optics.camera import FOCUS_DISTANCES_M, Camera, Lens
 
 LENS_TOLERANCE = 0.05
 FOCUS_TOLERANCE = 0.15
+MOST_COARSE = 2.0  # times as far, or as near, as what was measured: what a camera notes is off by no more
 AS_INFINITY_M = 50.0  # from where on no ring has a figure but that of infinity
 SENSOR_WIDTHS_MM = (0.5, 100.0)  # an endoscope's, and more than a digital back's
 VIEW_TOLERANCE = 1.05
@@ -70,10 +71,10 @@ def _all_but_infinite(focus_distance_m: float) -> Iterator[str]:
         )
 
 
-def taken_otherwise(exif: Exif, camera: Camera, *, is_refocused: bool) -> Iterator[str]:
+def taken_otherwise(exif: Exif, camera: Camera, *, is_refocused: bool, is_found: bool = False) -> Iterator[str]:
     """Warnings where a photograph was zoomed, rendered, or not taken as the camera was, as far as that is known.
 
-    ``is_refocused``: the photograph came with a focus distance of its own, or with known depths, which tell it.
+    ``is_refocused``: the photograph came with a focus distance of its own. ``is_found``: known depths tell it.
     """
     if exif.is_zoomed:
         said = f"its EXIF says a digital zoom of {exif.zoom:.4g}"
@@ -81,8 +82,8 @@ def taken_otherwise(exif: Exif, camera: Camera, *, is_refocused: bool) -> Iterat
     if exif.rendering is not None:
         yield f"its EXIF says {exif.rendering}: its blur may be computed, and no lens'"
     yield from _other_lens(exif, camera)
-    if not is_refocused:
-        yield from _other_focus(exif, camera.focus_distance_m)
+    if not is_found:
+        yield from _other_focus(exif, camera.focus_distance_m, is_refocused=is_refocused)
 
 
 def _other_lens(exif: Exif, camera: Camera) -> Iterator[str]:
@@ -140,18 +141,23 @@ def maybe_wrong_specs(lens: Lens | None, camera: Camera) -> Iterator[str]:
         )
 
 
-def _other_focus(exif: Exif, focus_distance_m: float) -> Iterator[str]:
+def _other_focus(exif: Exif, focus_distance_m: float, *, is_refocused: bool) -> Iterator[str]:
     """What cameras note is coarse, and counts from the sensor in most, at 1:1 a few focal lengths more."""
     noted_m = exif.subject_distance_m
-    if noted_m is None or (noted_m == math.inf and focus_distance_m >= AS_INFINITY_M):
+    if noted_m is None or min(noted_m, focus_distance_m) >= AS_INFINITY_M or (is_refocused and noted_m == math.inf):
         return
+    low, high = 1 / (1 + FOCUS_TOLERANCE), 1 / (1 - FOCUS_TOLERANCE)
+    if is_refocused:
+        low, high = 1 / MOST_COARSE, MOST_COARSE
     nearest_m = exif.focus_from_lens_m or min(noted_m, (exif.focal_length_mm or math.inf) / 1e3)
-    if not nearest_m / (1 + FOCUS_TOLERANCE) <= focus_distance_m <= noted_m / (1 - FOCUS_TOLERANCE):
+    if not nearest_m * low <= focus_distance_m <= noted_m * high:
         noted = "infinity" if noted_m == math.inf else f"{noted_m:.4g} m"
-        yield (
-            f"its EXIF says that it was focused at {noted}, the camera at {focus_distance_m:.4g} m: "
-            "send this shot's focus_distance_m"
+        told, advice = (
+            (f"focus_distance_m is {focus_distance_m:.4g} m", "it counts in metres, of dioptres the reciprocal")
+            if is_refocused
+            else (f"the camera at {focus_distance_m:.4g} m", "send this shot's focus_distance_m")
         )
+        yield f"its EXIF says that it was focused at {noted}, {told}: {advice}"
 
 
 def maybe_another_part(exif: Exif, camera: Camera) -> Iterator[str]:

@@ -334,9 +334,12 @@ def test_intrinsics_that_cannot_be_the_camera_s_are_warned_of(client: TestClient
     assert warned[1].startswith("fx_px is 964 by lens and 300 by intrinsics")
 
 
-def test_a_focus_that_the_photograph_notes_is_no_matter_where_it_is_told_or_follows(bench: TestClient) -> None:
+def test_a_focus_that_the_photograph_notes_is_no_matter_where_about_that_is_told_or_it_follows(
+    bench: TestClient,
+) -> None:
     noted = with_exif(jpeg(grey()), exif_of({}, {0x9206: (1, 1)}))
-    for told, is_warned in (({}, True), ({"focus_distance_m": 1.9}, False), ({"known": "20,20,1.1"}, False)):
+    about, other, known = {"focus_distance_m": 1.9}, {"focus_distance_m": 2.1}, {"known": "20,20,1.1"}
+    for told, is_warned in (({}, True), (about, False), (other, True), (other | known, False)):
         warned = ask(bench, noted, {"Content-Type": "image/jpeg"}, **told).headers["Camind-Warnings"]
         assert ("its EXIF says" in warned) == is_warned, told
 

@@ -206,13 +206,25 @@ def test_another_focus_than_the_camera_s_is_told_of_unless_it_came_with_the_phot
     assert len(said) == is_other
     noted = "infinity" if noted_m == math.inf else f"{noted_m} m"
     assert all(f"focused at {noted}, the camera at 2 m" in words for words in said)
-    assert not [*taken_otherwise(exif, CAMERA, is_refocused=True)]
+    assert not [*taken_otherwise(exif, CAMERA, is_refocused=False, is_found=True)]
+
+
+@pytest.mark.parametrize(
+    ("noted_m", "is_other"), [(0.5, True), (0.95, True), (1.1, False), (3.9, False), (4.1, True), (math.inf, False)]
+)
+def test_a_focus_that_came_with_the_photograph_need_only_be_about_what_it_notes(
+    noted_m: float, *, is_other: bool
+) -> None:
+    said = [*taken_otherwise(Exif(focal_length_mm=4.0, subject_distance_m=noted_m), CAMERA, is_refocused=True)]
+    assert len(said) == is_other
+    assert all("focus_distance_m is 2 m: it counts in metres, of dioptres the reciprocal" in words for words in said)
 
 
 def test_infinity_agrees_with_any_focus_that_no_ring_has_a_figure_for() -> None:
     infinite = Exif(focal_length_mm=50.0, subject_distance_m=math.inf)
     for focus_m, is_other in ((30.0, True), (50.0, False), (1e5, False)):
-        assert len([*taken_otherwise(infinite, CAMERA.focused_at(focus_m), is_refocused=False)]) == is_other
+        for noted in (infinite, replace(infinite, subject_distance_m=65.535)):
+            assert len([*taken_otherwise(noted, CAMERA.focused_at(focus_m), is_refocused=False)]) == is_other
     assert [*taken_otherwise(Exif(subject_distance_m=2.0), CAMERA.focused_at(1e5), is_refocused=False)]
 
 
