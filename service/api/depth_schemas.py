@@ -90,7 +90,8 @@ class DepthQuery(BaseModel):
         ),
     ] = None
     focus_distance_m: Annotated[
-        FocusDistance | None, Field(description="This shot's focus distance, if not the camera's")
+        FocusDistance | None,
+        Field(description="This shot's focus distance in metres, if not the camera's; 100000 stands for infinity"),
     ] = None
 
     known: Annotated[

@@ -111,9 +111,11 @@ class IntrinsicsRead(BaseModel):
 class CameraSpecs(Given):
     """A camera: exactly one of ``k_cam_px`` and ``lens``."""
 
-    image_width_px: Annotated[Pixels, Field(description="Width of the images it takes, upright")]
-    image_height_px: Annotated[Pixels, Field(description="Height of the images it takes, upright")]
-    focus_distance_m: Annotated[FocusDistance, Field(description="From the lens to the plane in focus")]
+    image_width_px: Annotated[Pixels, Field(description="Width of the images it takes, as the sensor lies")]
+    image_height_px: Annotated[Pixels, Field(description="Height of the images it takes, as the sensor lies")]
+    focus_distance_m: Annotated[
+        FocusDistance, Field(description="Metres from the lens to the plane in focus; 100000 stands for infinity")
+    ]
     k_cam_px: Annotated[
         BlurPixels | None, Field(description="Blur per unit of relative defocus, at `image_width_px`")
     ] = None
