@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from service.errors import ImageSizeMismatch
 from service.inference.exif import FULL_FRAME_DIAGONAL_MM, Exif
 from service.inference.images import TURNS, UNTURNS, Photograph
+from service.metres import focus_in_words
 from service.optics import thin_lens
-from service.optics.camera import FOCUS_DISTANCES_M, Camera, Lens
+from service.optics.camera import AS_INFINITY_M, FOCUS_DISTANCES_M, Camera, Lens
 
 LENS_TOLERANCE = 0.05
 FOCUS_TOLERANCE = 0.15
 MOST_COARSE = 2.0  # times as far, or as near, as what was measured: what a camera notes is off by no more
-AS_INFINITY_M = 50.0  # from where on no ring has a figure but that of infinity
 SENSOR_WIDTHS_MM = (0.5, 100.0)  # an endoscope's, and more than a digital back's
 VIEW_TOLERANCE = 1.05
 MOST_OFF_MIDDLE = 1 / 8  # of width or height: a sensor is put into its camera better than that
@@ -151,13 +151,13 @@ def _other_focus(exif: Exif, focus_distance_m: float, *, is_refocused: bool) -> 
         low, high = 1 / MOST_COARSE, MOST_COARSE
     nearest_m = exif.focus_from_lens_m or min(noted_m, (exif.focal_length_mm or math.inf) / 1e3)
     if not nearest_m * low <= focus_distance_m <= noted_m * high:
-        noted = "infinity" if noted_m == math.inf else f"{noted_m:.4g} m"
-        told, advice = (
-            (f"focus_distance_m is {focus_distance_m:.4g} m", "it counts in metres, of dioptres the reciprocal")
+        noted, told = focus_in_words(noted_m), focus_in_words(focus_distance_m)
+        ours, advice = (
+            (f"focus_distance_m is {told}", "it counts in metres, of dioptres the reciprocal")
             if is_refocused
-            else (f"the camera at {focus_distance_m:.4g} m", "send this shot's focus_distance_m")
+            else (f"the camera at {told}", "send this shot's focus_distance_m")
         )
-        yield f"its EXIF says that it was focused at {noted}, {told}: {advice}"
+        yield f"its EXIF says that it was focused at {noted}, {ours}: {advice}"
 
 
 def maybe_another_part(exif: Exif, camera: Camera) -> Iterator[str]:

@@ -19,6 +19,7 @@ from service.inference.layout import add_odds
 from service.inference.pair import SIDE_RANGES, Side
 from service.inference.part import Part
 from service.inference.resampling import bands, enlarged
+from service.metres import focus_in_words
 from service.opencv import cv2, exp, log
 from service.optics import thin_lens
 from service.optics.camera import Camera
@@ -91,9 +92,10 @@ class Clues:
         fitted = replace(camera.focused_at(fit.focus_distance_m), gamma_px=camera.gamma_px * fit.gamma_ratio)
         defocus = [thin_lens.signed_defocus(point.depth_m, fit.focus_distance_m) for point in known]
         leanings = tuple(max(-1.0, min(1.0, -x / SURELY_OUT)) for x in defocus)
+        found, high, before = map(focus_in_words, (fit.focus_distance_m, fit.high_m, camera.focus_distance_m))
         told = [
-            f"focused at {fit.focus_distance_m:.4g} m ({fit.low_m:.4g} to {fit.high_m:.4g}), where "
-            f"{camera.focus_distance_m:.4g} m was told, by what is known of the depth"
+            f"focused at {found} ({fit.low_m:.4g} to {high.removesuffix(' m')}), where {before} was told, by what is "
+            "known of the depth"
         ]
         if fit.gamma_ratio != 1:
             told.append(f"gamma_px taken as {fitted.gamma_px:.3g}, where {camera.gamma_px:.3g} was told")

@@ -11,6 +11,7 @@ RANGE_DEPTH_ERROR = 0.1
 ASPECT_TOLERANCE = 0.01
 F_NUMBERS = (0.5, 1_000.0)  # in air, light from a half space is the least; the fastest lens that was made is f/0.7
 FOCUS_DISTANCES_M = (0.001, 100_000.0)  # that can be told; the farthest stands for infinity
+AS_INFINITY_M = 50.0  # from where on no ring has a figure but that of infinity
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,11 +7,12 @@ from itertools import groupby, pairwise
 from typing import NamedTuple
 
 from service.optics import thin_lens
-from service.optics.camera import Camera
+from service.optics.camera import AS_INFINITY_M, Camera
 
 # standard deviations of a logarithm: of the focus distance that was told, as by a ring, of the gamma that was told, as
 # no specs do, the least of a blur read, and the most of where focus lies between what was said to be nearer and beyond
 TOLD_ERROR = 0.1
+INFINITY_ERROR_PER_M = 0.3  # of an inverse distance: what a lens of fixed focus, or a driver, says for want of another
 TOLD_GAMMA_ERROR = 0.3
 READING_ERROR = 0.1
 SIDE_ERROR = 0.05
@@ -19,11 +20,13 @@ SIDE_ERROR = 0.05
 # be it what was told
 TAIL = 2.5
 FARTHEST_OFF = 2.5
+NEAREST_FOR_INFINITY_M = 1.5
 # candidates over what was told, that itself first: what is farther off than they are need not be looked at
 FOCUS_STEP = math.log(FARTHEST_OFF) / 100
 FOCUS_RATIOS = tuple(math.exp(FOCUS_STEP * step) for step in sorted(range(-100, 101), key=abs))
 # what is likely is looked at in ever finer steps, until it is so many wide
 LEAST_STEPS, FINER_STEPS, MOST_PASSES = 10, 24, 4
+FOR_INFINITY_M = tuple(NEAREST_FOR_INFINITY_M * 100 / step for step in range(1, 100))
 GAMMA_RATIOS = tuple(FARTHEST_OFF ** (step / 6) for step in sorted(range(-6, 7), key=abs))
 LEAST_BLUR_PX = 0.1
 CONFIDENCE_95 = 1.92  # half of the 95 % quantile of chi squared with one degree of freedom
@@ -63,16 +66,17 @@ def fit_focus(camera: Camera, sightings: Sequence[Sighting], is_near: bool | Non
     It is the mean of what is likely, gamma the likeliest for it. Blur is in pixels of the camera's pictures. A known
     depth tells its side of focus, so that, other than depth from blur, this has one answer; from a single sighting
     close to focus the interval holds both, unless it is told whether all of the picture ``is_near``, nearer than what
-    is in focus, or beyond it. Neither end is farther from the camera's own than 2.5 times. Raises ``ValueError``
-    without a sighting.
+    is in focus, or beyond it. Neither end is farther from the camera's own than 2.5 times; what is said to be at
+    infinity is from 1.5 m on. Raises ``ValueError`` without a sighting.
     """
     if not sightings:
         raise ValueError("a focus distance is fitted to one known depth or more")
     search = _Search(camera, sightings, is_near)
-    search.look(camera.focus_distance_m * ratio for ratio in FOCUS_RATIOS)
+    told_m = camera.focus_distance_m
+    search.look((told_m, *FOR_INFINITY_M) if told_m >= AS_INFINITY_M else (told_m * ratio for ratio in FOCUS_RATIOS))
     search.look(_suited(camera, sightings))
     search.look_closer()
-    found = search.candidate(search.mean_m)
+    found = search.candidate(search.middle_m)
     low_m, high_m = search.likely_m
     fitted = replace(camera.focused_at(found.focus_distance_m), gamma_px=camera.gamma_px * found.gamma_ratio)
     deviations = tuple(abs(seen.deviation(fitted.blur_px(seen.depth_m))) for seen in sightings)
@@ -108,20 +112,28 @@ class _Search:
         return min((list(run) for _, run in by_likely), key=lambda run: min(each.loss for each in run))
 
     @property
-    def mean_m(self) -> float:
-        """The mean focus distance of those, by a logarithm's density: on both sides of what is seen to be in focus."""
+    def middle_m(self) -> float:
+        """The mean of those, in dioptres, as blur goes: amid both sides of what is seen to be in focus.
+
+        The likeliest where infinity was told: most that say so are there, and their mean could not be.
+        """
         run = self.likeliest
-        seen = [(math.log(each.focus_distance_m), math.exp(run[0].loss - each.loss)) for each in run]
+        if self.camera.focus_distance_m >= AS_INFINITY_M:
+            return min(run, key=lambda each: each.loss).focus_distance_m
+        seen = [(1 / each.focus_distance_m, math.exp(run[0].loss - each.loss)) for each in run]
         area = moment = 0.0
         for (low, low_density), (high, high_density) in pairwise(seen):
             area += (high - low) * (low_density + high_density)
             moment += (high - low) * (low_density * low + high_density * high)
-        return math.exp(moment / area) if area else run[0].focus_distance_m
+        return area / moment if area else run[0].focus_distance_m
 
     def look(self, distances_m: Iterable[float]) -> None:
         """Look at those focus distances that the lens can have and that are not too far from what was told."""
         told_m = self.camera.focus_distance_m
-        low_m, high_m = max(told_m * FOCUS_RATIOS[-2], self.camera.focal_length_m or 0.0), told_m * FOCUS_RATIOS[-1]
+        low_m, high_m = told_m * FOCUS_RATIOS[-2], told_m * FOCUS_RATIOS[-1]
+        if told_m >= AS_INFINITY_M:
+            low_m, high_m = NEAREST_FOR_INFINITY_M, told_m
+        low_m = max(low_m, self.camera.focal_length_m or 0.0)
         for focus_m in distances_m:
             if low_m < focus_m <= high_m:
                 self.looked.append(self.candidate(focus_m, self.most))
@@ -162,7 +174,12 @@ class _Search:
         # what is clearly blurred is seen to be out of focus, however little that is of a large k_cam
         side_error = min(SIDE_ERROR, max(self.camera.gamma_px, LEAST_BLUR_PX) / k_cam_px)
         off_side = (_off_side(each.depth_m, focus_m, self.is_near) / side_error for each in self.sightings)
-        off_told = math.log(focus_m / self.camera.focus_distance_m) / TOLD_ERROR
+        told_m = self.camera.focus_distance_m
+        off_told = (
+            (1 / focus_m - 1 / told_m) / INFINITY_ERROR_PER_M
+            if told_m >= AS_INFINITY_M
+            else math.log(focus_m / told_m) / TOLD_ERROR
+        )
         return _loss(off_told) + sum(map(_loss, off_side))
 
 

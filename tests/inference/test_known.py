@@ -73,6 +73,17 @@ def test_the_focus_follows_from_known_depths_where_it_is_far_away_too(estimator:
         assert answer.depth_m[int(point.v), int(point.u)] == pytest.approx(point.depth_m, rel=0.03)
 
 
+def test_a_lens_told_to_be_at_infinity_is_answered_as_it_is_focused_and_told_of_in_words(estimator: Estimator) -> None:
+    told = Camera(384, 256, 100_000.0, 7.6e-5, 0.5)
+    true, depths_m = told.focused_at(3.0), (0.8, 1.5)
+    picture = np.empty((256, 384, 3), np.uint8)
+    picture[:, :192], picture[:, 192:] = (brightness_for(true.blur_px(depth_m)) for depth_m in depths_m)
+    known = tuple(replace(point, depth_m=depth_m) for point, depth_m in zip(KNOWN, depths_m, strict=True))
+    answer = estimator.estimate(picture, told, known=known)
+    assert answer.camera.focus_distance_m == pytest.approx(3.0, rel=0.15)
+    assert "where infinity was told" in answer.warnings[0]
+
+
 def test_a_gamma_that_was_told_wrongly_follows_too(estimator: Estimator) -> None:
     blurry = replace(TRUE, gamma_px=1.0)
     picture = photograph()

@@ -131,3 +131,17 @@ def test_without_gamma_a_thing_in_focus_has_no_blur_and_is_no_fault() -> None:
 def test_nothing_known_tells_nothing() -> None:
     with pytest.raises(ValueError, match="one known depth"):
         fit_focus(CAMERA, [])
+
+
+@pytest.mark.parametrize("true_m", [10.0, 5.0, 3.0])
+def test_a_lens_said_to_be_at_infinity_is_found_at_its_hyperfocal_distance(true_m: float) -> None:
+    told = Camera(640, 480, 100_000.0, 7.6e-5, 0.5)
+    fit = fitted(true_m, 0.5, 0.8, 1.2, told=told)
+    assert 1 / fit.focus_distance_m == pytest.approx(1 / true_m, abs=0.04)
+    assert fit.low_m <= true_m <= fit.high_m
+
+
+def test_a_lens_at_infinity_is_left_there() -> None:
+    fit = fitted(100_000.0, 0.5, 0.8, 1.2, told=Camera(640, 480, 100_000.0, 7.6e-5, 0.5))
+    assert fit.focus_distance_m == fit.high_m == 100_000.0
+    assert fit.low_m < 50
