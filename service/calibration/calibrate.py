@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.calibration import fit
+from service.calibration.developed import sharpened, toned
 from service.calibration.edge import PointSpread, find_spread, fit_again
 from service.calibration.measure import (
     LEAST_CIRCLES,
@@ -171,11 +172,17 @@ def _result(task: Task, measured: list[Measured], at: Callable[[float], None]) -
             *otherwise_sized(usable),
             *placement.warnings,
             *constants.warnings,
-            *(refocused(circles, constants) if task.method == "edge" else ()),
+            *(_altered(found, constants) if task.method == "edge" else ()),
             *_uneven(corners),
             *apertures,
         ),
     )
+
+
+def _altered(found: _Fitted, constants: fit.Constants) -> tuple[str, ...]:
+    """What tells that blur is not that of one lens alone, locked."""
+    edges = [edge for one in found.usable for edge in one.edges]
+    return (*sharpened(edges, found.spread), *toned(found.usable), *refocused(found.circles, constants))
 
 
 def _fitted(task: Task, usable: list[Measured], size_px: tuple[int, int], at: Callable[[float], None]) -> _Fitted:

@@ -45,6 +45,7 @@ SMALL = 1e-3
 NEIGHBOURS = np.array([[0, 1, -1, 0, 0], [0, 0, 0, 1, -1]])  # of log radius and log blur: what slopes are seen from
 PRECISION = 1e-5
 SLICE_LEVEL = 0.95
+HALO = (1.5, 3.5)  # blurs from an edge, where sharpening leaves a ring
 SPREAD_DISCS = 24
 SPREAD_FROM = 1.4  # gammas of blur that tell shapes apart
 SOFTNESS_BOUNDS, SOFTNESS_STEP = (0.5, 2.0), 0.03  # in gammas
@@ -147,6 +148,15 @@ def find_spread(edges: Sequence[EdgeFit], gamma_px: float, tick: Callable[[], No
     best = minimize_scalar(of_disc, bounds=SOFTNESS_BOUNDS, method="bounded", options={"xatol": SOFTNESS_STEP})
     is_disc = best.fun < left_over(PointSpread("gaussian"))
     return PointSpread("disc", float(best.x) * gamma_px) if is_disc else PointSpread("gaussian")
+
+
+def halo(edge: EdgeFit, spread: PointSpread) -> float:
+    """How much brighter a ring of paper right around the disc is than the fit has it, as a part of the contrast."""
+    values, patch = np.array(edge.values), edge.patch
+    distance, _ = _distance(patch.columns - values[0], patch.rows - values[1], edge.radius_px, *values[3:5].tolist())
+    ring = (distance > HALO[0] * edge.blur_px) & (distance < HALO[1] * edge.blur_px)
+    rest = (patch.light - _picture(values, patch, spread)[0])[ring]
+    return float(rest.mean() / (values[7] * edge.contrast)) if rest.size else 0.0
 
 
 def slice_blur(light: NDArray[np.float32], x_px: float, y_px: float, radius_px: float) -> float:

@@ -76,5 +76,5 @@ def refocused(circles: Circles, constants: Constants) -> tuple[str, ...]:
     return (
         f"within photographs blur changes with depth otherwise than from one to the next, as if the focus had moved by "
         f"{spread:.0%} between them: k_cam_px and focus_distance_m may be off by far more than their intervals say; "
-        "lock focus, zoom and aperture, switch autofocus off",
+        "lock focus, zoom and aperture, switch autofocus off, and HDR and what removes noise or lifts contrast",
     )

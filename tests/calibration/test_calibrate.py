@@ -44,6 +44,7 @@ def test_the_camera_comes_out_of_its_photographs(report: Report) -> None:
     assert found.reprojection_rms_px < 0.1
     assert found.k_cam_px.low < 4.0 < found.k_cam_px.high
     assert found.to_camera().k_cam_px == found.k_cam_px.value
+    assert not found.warnings
 
 
 def test_every_photograph_is_told_of(report: Report) -> None:
@@ -128,10 +129,23 @@ def test_another_camera_among_them_is_left_out_or_warned_of(taken: list[SheetPho
     report = calibrate(Task(GRID), pictures([*taken, *strange]))
     told = [*report.pictures[-1].warnings, *(report.result.warnings if report.result else ())]
     assert told
+
+
+def test_one_of_another_size_is_left_out_and_what_the_camera_did_to_all_others_is_told(taken: list[SheetPhoto]) -> None:
     small: list[SheetPhoto] = [("small", "defocused", np.ascontiguousarray(taken[0][2][::2, ::2]))]
-    report = calibrate(Task(GRID), pictures([*taken, *small]))
+    level = np.linspace(0, 1, 256)
+    contrast = np.rint(255 * (3 * level**2 - 2 * level**3)).astype(np.uint8)
+    altered: list[SheetPhoto] = []
+    for name, role, pixels in taken:
+        shown = contrast[pixels].astype(np.float32)
+        sharp = shown + 0.6 * (shown - cv2.GaussianBlur(shown, (0, 0), 1.0))
+        altered.append((name, role, np.clip(sharp, 0, 255).astype(np.uint8)))
+    report = calibrate(Task(GRID), pictures([*altered, *small]))
     assert "left out: 400x300 px, while most are 800x600" in report.pictures[-1].warnings
     assert report.result is not None
+    told = " ".join(report.result.warnings)
+    assert "as sharpening leaves it" in told
+    assert "as a tone curve" in told
 
 
 def moved(shot: SheetPhoto) -> SheetPhoto:

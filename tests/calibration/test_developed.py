@@ -1,0 +1,60 @@
+"""What a camera's sharpening and tone curve leave at circles' edges, and that light as it fell shows neither."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from model_export.render import GAUSSIAN
+from service.calibration.developed import sharpened, toned
+from service.calibration.edge import EdgeFit, PointSpread, fit_edge
+from service.calibration.grid import FoundGrid
+from service.calibration.measure import Measured
+from service.calibration.report import PictureReport
+from service.opencv import cv2
+from service.optics.light import decode_srgb, encode_srgb
+from tests.calibration.test_edge import circle, photographed
+
+Levels = NDArray[np.float32]
+SPREAD = PointSpread("gaussian")
+
+
+def as_it_fell(levels: Levels) -> Levels:
+    return levels
+
+
+def with_contrast(levels: Levels) -> Levels:
+    return np.asarray(3 * levels**2 - 2 * levels**3, np.float32)
+
+
+def with_sharpening(levels: Levels) -> Levels:
+    return np.asarray(levels + 0.6 * (levels - cv2.GaussianBlur(levels, (0, 0), 1.0)), np.float32)
+
+
+def edges(develop: Callable[[Levels], Levels], *blur_px: float) -> list[EdgeFit]:
+    """Circles of a sheet of paper that were blurred so, and noisy, as a file has them."""
+    read, paper = [], 0.8 * circle()
+    for sigma in blur_px:
+        light = np.clip(photographed(paper, sigma, GAUSSIAN, 0.005), 0, 1)
+        levels = np.rint(255 * np.clip(develop(encode_srgb(light)), 0, 1)) / 255
+        read.append(fit_edge(decode_srgb(levels.astype(np.float32)), 63, 65, 24))
+    return read
+
+
+def seen(circles: list[EdgeFit]) -> list[Measured]:
+    count = len(circles)
+    grid = FoundGrid(np.zeros((count, 2)), np.full(count, 24.0), np.ones(count, np.bool_))
+    report = PictureReport("", "defocused", found=True)
+    return [Measured(report, grid=grid, circles=list(range(count)), edges=circles)]
+
+
+@pytest.mark.parametrize("develop", [as_it_fell, with_contrast, with_sharpening])
+def test_sharpening_is_told_by_its_ring_and_a_tone_curve_by_where_it_moves_edges(
+    develop: Callable[[Levels], Levels],
+) -> None:
+    sharp, blurred = edges(develop, 0.7, 0.9), edges(develop, 1.5, 3.0, 5.0)
+    assert len(sharpened(9 * blurred + 12 * sharp, SPREAD)) == (develop is with_sharpening)
+    told = toned(seen(sharp + blurred))
+    assert [words.startswith("circles look smaller the more") for words in told] == [True] * (develop is with_contrast)
+    assert toned([]) == ()
