@@ -49,7 +49,7 @@ MISFIT = 0.1
 MUST_SHOW = 0.5  # of gamma, that the largest defocus must reach
 GAMMA_BOUNDS_PX = (0.02, 20.0)
 K_CAM_BOUNDS_PX = (1e-6, 2000.0)  # of a lens focused at infinity next to nothing
-FOCUS_REACH = 3.0
+FOCUS_REACH = 300.0  # times the farthest sheet, and below the nearest: an interval must not end where a search does
 FOCUS_STARTS = 9
 
 
@@ -157,7 +157,8 @@ def _check_span(k_cam: Interval, instead: str = "") -> None:
     raise FitError(
         instead
         or f"k_cam_px may be anything from {k_cam.low:.2g} to {k_cam.high:.2g} by these photographs, which is no "
-        f"calibration: {BETTER}, so far that the circles are clearly blurred"
+        f"calibration: {BETTER}, so far that the circles are clearly blurred; where the lens is focused too far away "
+        "for that, focus it nearer, or give focus_distance_m"
     )
 
 

@@ -88,6 +88,22 @@ def test_one_side_is_said_and_stated_wide() -> None:
     assert given.focus_distance_m.low == given.focus_distance_m.high == pytest.approx(FOCUS)
 
 
+@pytest.mark.parametrize("focus_m", [8.0, 25.0, 125.0])
+def test_a_focus_far_beyond_all_sheets_is_in_the_intervals_or_nothing_is_told(focus_m: float) -> None:
+    """Where the search for it ended at three times the farthest sheet, k_cam came out up to twenty times too large."""
+    some, k_cam = circles(BOTH_SIDES, error=0.01), 4.0 / focus_m
+    off = some.blur_px / thin_lens.blur_at_depth(some.depth_m, FOCUS, K_CAM, GAMMA)
+    far = replace(some, blur_px=off * thin_lens.blur_at_depth(some.depth_m, focus_m, k_cam, GAMMA))
+    if focus_m < 10:
+        found = fit_constants(far, resamples=40)
+        assert found.k_cam_px.low < k_cam < found.k_cam_px.high
+        assert found.gamma_px.low < GAMMA < found.gamma_px.high
+        assert found.focus_distance_m.low < focus_m < found.focus_distance_m.high
+        return
+    with pytest.raises(FitError, match="focus it nearer, or give focus_distance_m"):
+        fit_constants(far, resamples=40)
+
+
 @pytest.mark.parametrize(
     ("given", "off"), [(0.985, 0), (1.0, 0), (1.015, 0), (0.97, 1), (1.05, 1), (0.95, 1), (1.12, 2), (0.8, 2)]
 )
