@@ -5,10 +5,11 @@ right around a circle than farther off. A tone curve moves the middle of an edge
 look larger or smaller the more they are blurred.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import theilslopes
+from numpy.typing import NDArray
 
 from service.calibration.edge import EdgeFit, PointSpread, halo
 from service.calibration.measure import FAR_RADII, Measured
@@ -17,6 +18,8 @@ SHARPEST = 24  # circles, whose edges sharpening changes most
 MOST = 0.75  # of them, that show a ring: real ink and paper scatter by some 0.03 from circle to circle
 MOST_HALO = 0.01  # of a circle's contrast
 MOST_MOVE = 0.03  # of an edge's middle, in blurs; from there on blur is off by up to 4 %
+LEAST_APART = 0.1  # of the thirds' blurs, in radii: sizes may differ by a little else
+SURELY = 2.0  # standard errors
 
 
 def sharpened(edges: Sequence[EdgeFit], spread: PointSpread) -> tuple[str, ...]:
@@ -33,7 +36,7 @@ def sharpened(edges: Sequence[EdgeFit], spread: PointSpread) -> tuple[str, ...]:
 
 
 def toned(measured: Sequence[Measured]) -> tuple[str, ...]:
-    """A warning where circles look larger, or smaller, the more they are blurred."""
+    """A warning where the more blurred third of the circles look larger, or smaller, than the less blurred one."""
     seen = [
         (edge.blur_px / radius, edge.radius_px / radius)
         for one in measured
@@ -41,14 +44,22 @@ def toned(measured: Sequence[Measured]) -> tuple[str, ...]:
         for edge, radius in zip(one.edges, one.grid.radii_px[one.circles], strict=True)
         if edge.blur_px < FAR_RADII * radius
     ]
-    if len(seen) < 2:
+    third = len(seen) // 3
+    if third == 0:
         return ()
-    blur, size = np.array(seen).T
-    _, _, low, high = theilslopes(size, blur)
-    if low <= MOST_MOVE and high >= -MOST_MOVE:
+    seen.sort()
+    (blur, _), (size, error) = (_middle(part) for part in np.array(seen[:third]).T)
+    (wider, _), (other, error_there) = (_middle(part) for part in np.array(seen[-third:]).T)
+    if abs(other - size) <= MOST_MOVE * max(wider - blur, LEAST_APART) + SURELY * math.hypot(error, error_there):
         return ()
     return (
-        f"circles look {'larger' if low > 0 else 'smaller'} the more they are blurred, as a tone curve (contrast, a "
-        "picture style, HDR) makes them: k_cam_px and gamma_px may be off by more than their intervals say; choose a "
+        f"circles look {'larger' if other > size else 'smaller'} the more they are blurred, as a tone curve (contrast, "
+        "a picture style, HDR) makes them: k_cam_px and gamma_px may be off by more than their intervals say; choose a "
         "neutral picture style, or send raw (.dng)",
     )
+
+
+def _middle(values: NDArray[np.float64]) -> tuple[float, float]:
+    """The median and about its standard error."""
+    middle = float(np.median(values))
+    return middle, 1.25 * 1.4826 * float(np.median(np.abs(values - middle))) / math.sqrt(values.size)
