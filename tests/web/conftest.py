@@ -4,11 +4,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, BrowserContext, Page, expect
 
 from model_export.started_server import Server, serving
 from tests.web.chromium import running_browser
-from tests.web.watched import watched
+from tests.web.watched import lasting, watched_in
 
 AXE = Path(__file__).parents[2] / "node_modules" / "axe-core" / "axe.min.js"
 PATIENCE_MS = 20_000  # on a machine that has other work
@@ -36,10 +36,17 @@ def expected_errors() -> list[str]:
     return []
 
 
+@pytest.fixture(scope="module")
+def context(browser: Browser, served: Server) -> Iterator[BrowserContext]:
+    """A module's: half of what it costs to open a page is its context. A tab has its own storage; there is no other."""
+    with lasting(browser, served.url) as context:
+        yield context
+
+
 @pytest.fixture
-def page(browser: Browser, served: Server, expected_errors: list[str]) -> Iterator[Page]:
-    """A page in a browser context of its own, whose addresses are relative to the service; it fails on complaints."""
-    with watched(browser, served.url, expected_errors) as opened:
+def page(context: BrowserContext, served: Server, expected_errors: list[str]) -> Iterator[Page]:
+    """A page of its own, whose addresses are relative to the service; it fails on complaints."""
+    with watched_in(context, served.url, expected_errors) as opened:
         yield opened
 
 

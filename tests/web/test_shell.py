@@ -4,13 +4,14 @@ import json
 import re
 import signal
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, FilePayload, Page, expect
+from playwright.sync_api import Browser, BrowserContext, FilePayload, Page, expect
 
 from model_export.started_server import Server, serving
 from service.config import DATABASE_FILE
@@ -20,7 +21,7 @@ from service.storage.engine import open_engine
 from service.storage.keys import Keys
 from tests.inference.photographs import png
 from tests.web.steps import OVERFLOW, to_photographs
-from tests.web.watched import watched
+from tests.web.watched import lasting, watched, watched_in
 
 ROOT = Path(__file__).parents[2]
 TABS = ("depth", "cameras", "calibrate", "status")
@@ -40,13 +41,18 @@ class Keyed:
 
     server: Server
     keys: Keys
+    context: BrowserContext
+
+    def page(self, expected: list[str]) -> AbstractContextManager[Page]:
+        """A page that knows no key: it is kept for a tab."""
+        return watched_in(self.context, self.server.url, expected)
 
     def key(self, *scopes: Scope) -> str:
         return self.keys.create("page", "page", scopes or EVERYDAY)[1]
 
 
 @pytest.fixture(scope="module")
-def keyed(tmp_path_factory: pytest.TempPathFactory, tiny_model_dir: Path) -> Iterator[Keyed]:
+def keyed(browser: Browser, tmp_path_factory: pytest.TempPathFactory, tiny_model_dir: Path) -> Iterator[Keyed]:
     data_dir = tmp_path_factory.mktemp("keyed") / "data"
     data_dir.mkdir()
     engine = open_engine(f"sqlite:///{data_dir / DATABASE_FILE}")
@@ -54,8 +60,11 @@ def keyed(tmp_path_factory: pytest.TempPathFactory, tiny_model_dir: Path) -> Ite
     keys = Keys(engine)
     keys.create("first", "nobody")
     wanted = {"CAMIND_API_KEYS": "on", "CAMIND_KEY_REQUESTS_PER_MINUTE": str(QUOTA)}
-    with serving(data_dir, "--model", tiny_model_dir, settings=wanted) as server:
-        yield Keyed(server, keys)
+    with (
+        serving(data_dir, "--model", tiny_model_dir, settings=wanted) as server,
+        lasting(browser, server.url) as context,
+    ):
+        yield Keyed(server, keys, context)
     engine.dispose()
 
 
@@ -168,8 +177,8 @@ def test_status_tells_what_the_service_tells(page: Page, served: Server) -> None
     served.ask("DELETE", "/cameras/status")
 
 
-def test_a_key_is_asked_for_once_and_kept_for_the_tab(browser: Browser, keyed: Keyed) -> None:
-    with watched(browser, keyed.server.url, [REFUSED]) as page:
+def test_a_key_is_asked_for_once_and_kept_for_the_tab(keyed: Keyed) -> None:
+    with keyed.page([REFUSED]) as page:
         page.goto("#cameras")
         dialog = page.get_by_role("dialog", name="API key")
         expect(dialog).to_be_visible()
@@ -193,8 +202,8 @@ def test_a_key_is_asked_for_once_and_kept_for_the_tab(browser: Browser, keyed: K
         expect(dialog).to_be_visible()
 
 
-def test_a_browser_that_stores_nothing_holds_the_key_until_the_page_is_left(browser: Browser, keyed: Keyed) -> None:
-    with watched(browser, keyed.server.url, [REFUSED]) as page:
+def test_a_browser_that_stores_nothing_holds_the_key_until_the_page_is_left(keyed: Keyed) -> None:
+    with keyed.page([REFUSED]) as page:
         page.add_init_script(NO_STORAGE)
         page.goto("#cameras")
         give_key(page, keyed.key())
@@ -202,10 +211,8 @@ def test_a_browser_that_stores_nothing_holds_the_key_until_the_page_is_left(brow
         expect(page.get_by_text("There is no camera yet.")).to_be_visible()
 
 
-def test_without_a_key_the_page_says_what_it_lacks(
-    browser: Browser, keyed: Keyed, barriers: Callable[[Page], list[str]]
-) -> None:
-    with watched(browser, keyed.server.url, [REFUSED]) as page:
+def test_without_a_key_the_page_says_what_it_lacks(keyed: Keyed, barriers: Callable[[Page], list[str]]) -> None:
+    with keyed.page([REFUSED]) as page:
         page.goto("")
         expect(page.get_by_role("dialog", name="API key")).to_be_visible()
         assert barriers(page) == []
@@ -218,11 +225,11 @@ def test_without_a_key_the_page_says_what_it_lacks(
         expect(page.get_by_role("alert").filter(visible=True)).to_have_count(0)
 
 
-def test_another_owners_key_brings_its_own_cameras(browser: Browser, keyed: Keyed, d200: dict[str, Any]) -> None:
+def test_another_owners_key_brings_its_own_cameras(keyed: Keyed, d200: dict[str, Any]) -> None:
     known, key = keyed.keys.create("guest", "guest", EVERYDAY)
     headers = {"Authorization": f"Bearer {key}", "Content-Type": "application/json"}
     assert keyed.server.ask("POST", "/cameras", json.dumps({**d200, "name": "theirs"}), headers).status == 201
-    with watched(browser, keyed.server.url, [REFUSED, "status of 404"]) as page:
+    with keyed.page([REFUSED, "status of 404"]) as page:
         page.goto("#cameras/theirs")
         give_key(page, key)
         theirs = page.get_by_role("button", name="theirs")
@@ -234,8 +241,8 @@ def test_another_owners_key_brings_its_own_cameras(browser: Browser, keyed: Keye
         expect(theirs).to_have_count(0)
 
 
-def test_photographs_of_the_sheet_ask_once_for_a_key_that_nobody_gives(browser: Browser, keyed: Keyed) -> None:
-    with watched(browser, keyed.server.url, [REFUSED]) as page:
+def test_photographs_of_the_sheet_ask_once_for_a_key_that_nobody_gives(keyed: Keyed) -> None:
+    with keyed.page([REFUSED]) as page:
         page.goto("")
         dialog = page.get_by_role("dialog", name="API key")
         expect(dialog).to_be_visible()
@@ -254,10 +261,8 @@ def test_photographs_of_the_sheet_ask_once_for_a_key_that_nobody_gives(browser: 
 
 
 @pytest.mark.parametrize(("scopes", "seen"), [(EVERYDAY, "scope admin"), (SCOPES, "waiting")])
-def test_status_shows_what_the_key_may_see(
-    browser: Browser, keyed: Keyed, scopes: tuple[Scope, ...], seen: str
-) -> None:
-    with watched(browser, keyed.server.url, [REFUSED, "status of 403"]) as page:
+def test_status_shows_what_the_key_may_see(keyed: Keyed, scopes: tuple[Scope, ...], seen: str) -> None:
+    with keyed.page([REFUSED, "status of 403"]) as page:
         page.goto("")
         give_key(page, keyed.key(*scopes))
         page.get_by_role("tab", name="Status").click()
@@ -267,12 +272,10 @@ def test_status_shows_what_the_key_may_see(
         assert '"openapi"' in saved.value.path().read_text()
 
 
-def test_who_may_not_list_cameras_reads_by_the_one_that_a_link_names(
-    browser: Browser, keyed: Keyed, d200: dict[str, Any]
-) -> None:
+def test_who_may_not_list_cameras_reads_by_the_one_that_a_link_names(keyed: Keyed, d200: dict[str, Any]) -> None:
     headers = {"Authorization": f"Bearer {keyed.key()}", "Content-Type": "application/json"}
     assert keyed.server.ask("POST", "/cameras", json.dumps(d200), headers).status == 201
-    with watched(browser, keyed.server.url, [REFUSED, "status of 403"]) as page:
+    with keyed.page([REFUSED, "status of 403"]) as page:
         page.goto("#cameras")
         give_key(page, keyed.key("depth"))
         expect(page.get_by_text("The list did not come.")).to_be_visible()
@@ -289,11 +292,11 @@ def test_who_may_not_list_cameras_reads_by_the_one_that_a_link_names(
     keyed.server.ask("DELETE", f"/cameras/{d200['name']}", headers=headers)
 
 
-def test_a_quota_says_when_to_come_back(browser: Browser, keyed: Keyed) -> None:
+def test_a_quota_says_when_to_come_back(keyed: Keyed) -> None:
     key = keyed.key()
     for _ in range(QUOTA):
         keyed.server.ask("GET", "/model", headers={"Authorization": f"Bearer {key}"})
-    with watched(browser, keyed.server.url, [REFUSED, "status of 429"]) as page:
+    with keyed.page([REFUSED, "status of 429"]) as page:
         page.goto("")
         give_key(page, key)
         problem = page.get_by_role("alert").filter(has_text="Quota exceeded").first
