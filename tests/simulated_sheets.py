@@ -13,6 +13,7 @@ from service.optics.camera import Intrinsics
 GRID = CircleGrid("asymmetric_circles", 7, 3, 26.0, 18.0)
 CAMERA = GridCamera(800, 600, 4.0, 0.7, 0.5, Intrinsics(900, 900, 400, 300, (-0.05, 0.02, 0, 0, 0)))
 DEPTHS_M = (0.34, 0.4, 0.46, 0.6, 0.75, 0.9)
+FEW_DEPTHS_M = (0.34, 0.46, 0.6, 0.9)  # enough that nothing is warned of
 
 SheetPhoto = tuple[str, Role, NDArray[np.uint8]]
 

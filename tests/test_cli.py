@@ -29,7 +29,7 @@ from service.storage.calibrations import CalibrationDraft, Calibrations
 from service.storage.engine import open_engine, writing
 from service.storage.tables import CalibrationRow
 from tests.inference.oracle_pair import brightness_for
-from tests.simulated_sheets import CAMERA, DEPTHS_M, sheet_photos
+from tests.simulated_sheets import CAMERA, FEW_DEPTHS_M, sheet_photos
 
 CAMIND = Path(sys.executable).parent / "camind"
 
@@ -214,7 +214,7 @@ def run_extra() -> None:
 def test_a_folder_of_photographs_gives_a_camera(own_folder: Path) -> None:
     folder, out = own_folder / "photos", own_folder / "found.json"
     folder.mkdir()
-    for name, _, rgb in sheet_photos(CAMERA, DEPTHS_M):
+    for name, _, rgb in sheet_photos(CAMERA, FEW_DEPTHS_M):
         cv2.imwrite(str(folder / f"{name}.png"), rgb[:, :, ::-1])
     pattern = ("--rows", "7", "--columns", "3", "--spacing-mm", "26", "--diameter-mm", "18")
     done = camind(own_folder, "calibrate", str(folder), *pattern, "--out", str(out), "--register", "bench")

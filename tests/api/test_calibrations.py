@@ -20,7 +20,7 @@ from service.config import Settings
 from service.inference.exif import F_NUMBER
 from tests.fake_calibration import RESULT, SETTINGS, FakeCalibration, without_calibrations
 from tests.inference.photographs import corners, exif_of, jpeg, png, with_exif
-from tests.simulated_sheets import CAMERA, DEPTHS_M, GRID, sheet_photos
+from tests.simulated_sheets import CAMERA, FEW_DEPTHS_M, GRID, sheet_photos
 
 PROBLEM = "application/problem+json"
 PATIENCE_S = 15.0
@@ -493,14 +493,14 @@ def test_photographs_of_a_sheet_become_a_camera_that_depth_can_use(settings: Set
         "register": True,
     }
     wide_open, stopped_down = (exif_of({}, {F_NUMBER: (number, 10)}) for number in (20, 56))
-    photos = [(name, jpeg(rgb)) for name, _, rgb in sheet_photos(CAMERA, DEPTHS_M)]
+    photos = [(name, jpeg(rgb)) for name, _, rgb in sheet_photos(CAMERA, FEW_DEPTHS_M)]
     parts = [picture(name=f"{name}.jpg", content=with_exif(data, wide_open)) for name, data in photos]
     with TestClient(create_app(whole)) as client:
         response = send(client, settings_part(given), *parts, prefer="wait=60")
         assert response.status_code == 200, response.text
         found = response.json()
         assert found["state"] == "succeeded", found["problem"]
-        assert [image["found"] for image in found["images"]] == [True] * len(DEPTHS_M)
+        assert [image["found"] for image in found["images"]] == [True] * len(FEW_DEPTHS_M)
         assert found["result"]["point_spread"] == "disc"
         camera = client.get("/cameras/bench").json()
         assert camera["k_cam_px"] == pytest.approx(CAMERA.k_cam_px, rel=0.04)
