@@ -41,10 +41,10 @@ def watched(browser: Browser, url: str, expected: list[str], **options: Any) -> 
 def watched_in(context: BrowserContext, url: str, expected: list[str]) -> Iterator[Page]:
     """A page in a context that goes on; it, pages that it opened, and what it was permitted are gone afterwards."""
     complaints: list[str] = []
-    before = context.pages
+    before = context.pages  # of which one that is a picture asks for an icon
 
     def note_message(message: ConsoleMessage) -> None:
-        if message.type == "error":
+        if message.type == "error" and message.page not in before:
             complaints.append(f"{message.text} ({message.location.get('url', '')})")
 
     def note_error(caught: WebError) -> None:
@@ -64,6 +64,7 @@ def watched_in(context: BrowserContext, url: str, expected: list[str]) -> Iterat
         for opened in context.pages:
             if opened not in before:
                 opened.close()
+        context.set_offline(False)
         context.clear_permissions()
         context.remove_listener("console", note_message)
         context.remove_listener("weberror", note_error)
