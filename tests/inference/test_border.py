@@ -48,6 +48,15 @@ def test_a_border_is_found_to_a_few_pixels_however_it_is_shaped(shape: str) -> N
     assert (found != hidden).mean() < 0.01
 
 
+def test_a_border_about_a_scene_without_blue_is_found() -> None:
+    hidden, rgb = outside("circle"), scene()
+    rgb[..., 2] = 0
+    rgb[hidden] = 0
+    found = black_border(rgb)
+    assert found is not None
+    assert (found != hidden).mean() < 0.01
+
+
 def shadow(rgb: Pixels) -> Pixels:
     light = np.clip((np.arange(WIDTH) - 160) / 160, 0, 1)[:, np.newaxis]
     return np.asarray(rgb * light, np.uint8)
@@ -64,7 +73,13 @@ def with_dark_object(rgb: Pixels) -> Pixels:
     return rgb
 
 
-@pytest.mark.parametrize("darken", [np.copy, np.zeros_like, shadow, with_square, with_dark_object])
+def with_dark_red_object(rgb: Pixels) -> Pixels:
+    return np.asarray(with_dark_object(rgb) * np.where(rgb.max(2, keepdims=True) < 20, (1, 0, 0), 1), np.uint8)
+
+
+@pytest.mark.parametrize(
+    "darken", [np.copy, np.zeros_like, shadow, with_square, with_dark_object, with_dark_red_object]
+)
 def test_what_is_dark_in_a_photograph_is_no_border(darken: Callable[[Pixels], Pixels]) -> None:
     assert black_border(darken(scene())) is None
 
@@ -77,6 +92,15 @@ def test_what_is_seen_is_continued_mirrored() -> None:
     filled = continued(rgb, hidden)
     np.testing.assert_array_equal(filled[:seen], rgb[seen + 1 : 2 * seen + 1][::-1])
     np.testing.assert_array_equal(filled[seen : HEIGHT - seen], rgb[seen : HEIGHT - seen])
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_a_border_wider_than_what_is_seen_is_continued_by_the_far_edge(turns: int) -> None:
+    rgb, hidden = scene(), np.zeros((HEIGHT, WIDTH), np.bool_)
+    hidden[:, :400] = True
+    filled = np.rot90(continued(np.rot90(rgb, turns).copy(), np.rot90(hidden, turns).copy()), -turns)
+    np.testing.assert_array_equal(filled[:, :402], rgb[:, np.minimum(2 * 402 - np.arange(402), WIDTH - 1)])
+    np.testing.assert_array_equal(filled[:, 402:], rgb[:, 402:])
 
 
 def test_where_nothing_is_seen_beyond_the_outline_its_nearest_pixel_is_continued() -> None:

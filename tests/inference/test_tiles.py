@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from service.inference.artifact import load_model_folder
 from service.inference.estimator import Estimator
 from service.inference.pair import GraphPair
-from service.inference.tiles import OVERLAP_PX, PIXEL_BUDGET, fades, read_in_tiles, spans
+from service.inference.tiles import OVERLAP_PX, PIXEL_BUDGET, Span, fades, layout, read_in_tiles, spans
 from service.opencv import cv2
 from service.optics.camera import Camera
 from tests.inference.oracle_pair import build_oracle_pair
@@ -32,9 +32,38 @@ def test_spans_cover_everything_and_overlap_enough(size: int, count: int) -> Non
     assert max(sizes) - min(sizes) <= 16 * len(found)
 
 
+def longest(along: list[Span]) -> int:
+    return max(span.stop - span.start for span in along)
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "budget"),
+    [(1250, 5000, 1_000_000), (3500, 1700, 1_000_000), (3072, 4080, 1_000_000), (3072, 4080, PIXEL_BUDGET)],
+)
+def test_of_all_tiles_within_the_budget_those_are_taken_that_read_the_least_twice(
+    height: int, width: int, budget: int
+) -> None:
+    most = [size // (2 * OVERLAP_PX + 16) for size in (height, width)]
+    reads = [
+        longest(spans(height, down, 16)) * longest(spans(width, across, 16)) * down * across
+        for down in range(1, most[0] + 1)
+        for across in range(1, most[1] + 1)
+        if longest(spans(height, down, 16)) * longest(spans(width, across, 16)) <= budget
+    ]
+    rows, columns = layout(height, width, 16, budget)
+    tile = longest(rows) * longest(columns)
+    assert tile <= budget
+    assert tile * len(rows) * len(columns) == min(reads)
+
+
+def test_no_tile_is_narrower_than_two_overlaps_however_small_the_budget() -> None:
+    rows, columns = layout(1250, 470, 16, 1)
+    assert (len(rows), len(columns)) == (2, 1)
+
+
 @given(size=st.integers(300, 5000), stride=st.sampled_from([1, 2, 4]))
 def test_weights_sum_to_one_at_every_pixel(size: int, stride: int) -> None:
-    found = spans(size, max(1, size // 400), 16)
+    found = spans(size, max(1, size // 250), 16)  # three of them share pixels
     total = np.zeros(-(-size // stride))
     for span, weight in zip(found, fades(found, stride), strict=True):
         assert (weight >= 0).all()
@@ -62,7 +91,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> GraphPair:
     return GraphPair(load_model_folder(folder), 1)
 
 
-@pytest.mark.parametrize(("height", "width"), [(701, 1003), (400, 1600)])
+@pytest.mark.parametrize(("height", "width"), [(701, 1003), (1400, 480)])
 def test_tiled_equals_untiled(pair: GraphPair, height: int, width: int) -> None:
     rgb = np.random.default_rng(0).integers(30, 130, (height // 20, width // 20, 3), np.uint8)
     rgb = np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_CUBIC), np.uint8)

@@ -104,10 +104,11 @@ def test_a_doubtful_reading_moves_it_less() -> None:
     assert 1.6 < sure < doubtful < 2.0
 
 
-def test_one_thing_mistaken_does_not_decide_and_is_told_apart() -> None:
+@pytest.mark.parametrize("mistaken_m", [1.6, 0.4])
+def test_one_thing_mistaken_does_not_decide_and_is_told_apart(mistaken_m: float) -> None:
     true = CAMERA.focused_at(1.8)
     seen = [Sighting(depth_m, true.blur_px(depth_m), EXACT) for depth_m in DEPTHS_M]
-    fit = fit_focus(CAMERA, [replace(seen[0], depth_m=1.6), *seen[1:]])
+    fit = fit_focus(CAMERA, [replace(seen[0], depth_m=mistaken_m), *seen[1:]])
     assert fit.focus_distance_m == pytest.approx(1.8, rel=0.05)
     assert fit.deviations[0] > 3 > max(fit.deviations[1:])
 
