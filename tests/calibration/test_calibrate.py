@@ -213,7 +213,9 @@ def test_what_is_no_photograph_is_said_and_the_others_count(taken: list[SheetPho
         raise InvalidImage("The file is empty.")
 
     blank: list[SheetPhoto] = [("blank", "defocused", np.full((600, 800, 3), 90, np.uint8))]
-    bright: list[SheetPhoto] = [("bright", "defocused", np.minimum(taken[1][2].astype(int) * 2, 255).astype(np.uint8))]
+    lamp = taken[1][2].copy()
+    lamp[:, 320:, 0] = np.minimum(lamp[:, 320:, 0].astype(int) * 2, 255)  # red light: one channel alone is cut off
+    bright: list[SheetPhoto] = [("bright", "defocused", lamp)]
     small: list[SheetPhoto] = [("small", "defocused", np.ascontiguousarray(taken[0][2][::2, ::2]))]
     report = calibrate(
         Task(GRID),
@@ -221,7 +223,10 @@ def test_what_is_no_photograph_is_said_and_the_others_count(taken: list[SheetPho
     )
     assert report.pictures[0].warnings == ("The file is empty.",)
     assert report.pictures[1].warnings == ("no grid of dark circles was found",)
-    assert "overexposed" in report.pictures[2].warnings[0]
+    assert (
+        report.pictures[2].warnings[0].startswith("15 of 21 circles not measured: the paper around it is overexposed")
+    )
+    assert report.pictures[2].warnings[1:] == ("left out: 6 circles do not place the sheet, 8 are needed",)
     assert "left out: 400x300 px, while most are 800x600" in report.pictures[-1].warnings
     assert report.result is not None
     assert report.result.k_cam_px.value == pytest.approx(4.0, rel=0.04)

@@ -35,6 +35,7 @@ from service.optics.camera import Camera, Intrinsics
 CAMERA = Camera(40, 30, 2.0, 6.0, intrinsics=Intrinsics(50.0, 52.0, 19.5, 14.5))
 RGB = np.random.default_rng(1).integers(0, 255, (30, 40, 3), np.uint8)
 BESIDE = Beside(RGB)
+COLOURS = ["red", "green", "blue"]
 
 
 @pytest.fixture
@@ -60,6 +61,17 @@ def read_png(body: bytes) -> NDArray[np.uint16]:
     assert pixels is not None
     assert pixels.dtype == np.uint16
     return np.asarray(pixels, np.uint16)
+
+
+def read_ply(body: bytes) -> NDArray[Any]:
+    """The points, laid out as the header says."""
+    head, _, stored = body.partition(b"end_header\n")
+    lines = [line.split() for line in head.decode("ascii").splitlines()]
+    kinds = {"float": "<f4", "uchar": "u1"}
+    points = np.frombuffer(stored, [(words[2], kinds[words[1]]) for words in lines if words[0] == "property"])
+    assert lines[:2] == [["ply"], ["format", "binary_little_endian", "1.0"]]
+    assert ["element", "vertex", str(len(points))] in lines
+    return points
 
 
 def test_png_holds_millimetres_and_zero_for_no_answer(answer: DepthMap) -> None:
@@ -159,35 +171,30 @@ def test_nothing_seen_is_a_cloud_without_points(answer: DepthMap) -> None:
 
 
 def test_ply_points_project_back_to_their_pixels(answer: DepthMap) -> None:
-    head, _, body = encode_ply(answer, BESIDE).body.partition(b"end_header\n")
-    assert b"element vertex 1199\n" in head
-    kinds = [(axis, "<f4") for axis in "xyz"] + [(colour, "u1") for colour in "rgb"]
-    points = np.frombuffer(body, np.dtype(kinds))
+    points = read_ply(encode_ply(answer, BESIDE).body)
+    assert len(points) == 1199
     v, u = np.nonzero(answer.valid)
     np.testing.assert_allclose(points["x"] / points["z"] * 50 + 19.5, u, atol=1e-3)
     np.testing.assert_allclose(points["y"] / points["z"] * 52 + 14.5, v, atol=1e-3)
-    np.testing.assert_array_equal(np.stack([points[c] for c in "rgb"], 1), RGB[v, u])
+    np.testing.assert_array_equal(points[COLOURS].tolist(), RGB[v, u])
 
 
 def test_points_of_a_smaller_map_look_where_the_photograph_s_pixels_do_and_have_their_colours(answer: DepthMap) -> None:
-    head, _, body = encode_ply(answer.shrunk(16), BESIDE).body.partition(b"end_header\n")
-    points = np.frombuffer(body, np.dtype([(axis, "<f4") for axis in "xyz"] + [(colour, "u1") for colour in "rgb"]))
-    assert f"element vertex {16 * 12}\n".encode() in head
+    points = read_ply(encode_ply(answer.shrunk(16), BESIDE).body)
+    assert len(points) == 16 * 12
     # a pixel of it is two and a half of the photograph's
     v, u = (lines.ravel() * 2.5 + 0.75 for lines in np.indices((12, 16)))
     np.testing.assert_allclose(points["x"] / points["z"] * 50 + 19.5, u, atol=1e-3)
     np.testing.assert_allclose(points["y"] / points["z"] * 52 + 14.5, v, atol=1e-3)
     row, column = (np.floor(place + 0.5).astype(int) for place in (v, u))
     np.testing.assert_array_equal(points["z"], answer.depth_m[row, column])
-    np.testing.assert_array_equal(np.stack([points[c] for c in "rgb"], 1), RGB[row, column])
+    np.testing.assert_array_equal(points[COLOURS].tolist(), RGB[row, column])
 
 
 def test_points_leave_the_lens_distortion_out(answer: DepthMap) -> None:
     distortion = (-0.2, 0.05, 1e-3, -2e-3, 0.01)
     bent = replace(answer, camera=replace(CAMERA, intrinsics=Intrinsics(50.0, 52.0, 19.5, 14.5, distortion)))
-    body = encode_ply(bent, BESIDE).body.partition(b"end_header\n")[2]
-    kinds = [(axis, "<f4") for axis in "xyz"] + [(colour, "u1") for colour in "rgb"]
-    points = np.frombuffer(body, np.dtype(kinds))
+    points = read_ply(encode_ply(bent, BESIDE).body)
     matrix = np.array([[50.0, 0, 19.5], [0, 52.0, 14.5], [0, 0, 1]])
     places, _ = cv2.projectPoints(
         np.stack([points[axis] for axis in "xyz"], 1).astype(np.float64),
@@ -223,9 +230,8 @@ def test_points_of_a_large_picture_leave_distortion_out_without_a_search_for_eac
         return undistort(places, *others, **options)
 
     monkeypatch.setattr(cv2, "undistortPoints", counting)
-    body = encode_ply(large, Beside(np.zeros((*size, 3), np.uint8))).body.partition(b"end_header\n")[2]
+    points = read_ply(encode_ply(large, Beside(np.zeros((*size, 3), np.uint8))).body)
     assert sum(sought) < valid.size / 4
-    points = np.frombuffer(body, np.dtype([(axis, "<f4") for axis in "xyz"] + [(colour, "u1") for colour in "rgb"]))
     ahead = np.stack([points[axis] for axis in "xyz"], 1).astype(np.float64)
     places = cv2.projectPoints(ahead, np.zeros(3), np.zeros(3), np.array(lens.matrix), np.array(terms))[0][:, 0]
     off = np.hypot(*(places - np.stack(np.nonzero(valid)[::-1], 1)).T)
@@ -238,9 +244,7 @@ def test_what_no_ray_is_distorted_to_is_no_point(answer: DepthMap, cx_px: float,
     lens = Intrinsics(38.0, 38.0, cx_px, cy_px, (-0.3, 0, 0, 0, 0))
     folding = replace(answer, camera=replace(CAMERA, intrinsics=lens))
     told = encode_ply(folding, BESIDE)
-    head, _, body = told.body.partition(b"end_header\n")
-    points = np.frombuffer(body, np.dtype([(axis, "<f4") for axis in "xyz"] + [(colour, "u1") for colour in "rgb"]))
-    assert f"element vertex {len(points)}\n".encode() in head
+    points = read_ply(told.body)
     ahead = np.stack([points[axis] / points["z"] for axis in "xyz"], 1).astype(np.float64)
     matrix = np.array([[38.0, 0, cx_px], [0, 38.0, cy_px], [0, 0, 1]])
     places = cv2.projectPoints(ahead, np.zeros(3), np.zeros(3), matrix, np.array(lens.distortion))[0][:, 0]
