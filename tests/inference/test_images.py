@@ -282,13 +282,21 @@ def test_the_quality_of_a_jpeg_with_steps_of_16_bits_is_that_of_its_luminance() 
     assert read_header(data[:at] + wide + data[at:]).quality == pytest.approx(40, abs=0.3)
 
 
+def test_exif_and_xmp_of_a_jpeg_are_told_apart_in_either_order() -> None:
+    data, xmp = jpeg(corners(), 6), b"http://ns.adobe.com/xap/1.0/\0<x:xmpmeta/>"
+    segment = b"\xff\xe1" + struct.pack(">H", len(xmp) + 2) + xmp
+    for at in (2, data.index(b"\xff\xdb")):
+        header = read_header(data[:at] + segment + data[at:])
+        assert (header.orientation, header.xmp) == (6, xmp)
+
+
 def test_what_stands_behind_the_end_of_a_jpeg_does_no_harm() -> None:
     assert read_photograph(jpeg(corners()) + b"a maker's trailer").rgb.shape == (48, 64, 3)
 
 
 @pytest.mark.parametrize("data", [b"hello, world", b"%PDF-1.7", b"GIF89a" + bytes(50), b"\x00" * 100, b"RIFF"])
 def test_bytes_that_are_no_listed_kind_are_refused(data: bytes) -> None:
-    with pytest.raises(UnsupportedKind):
+    with pytest.raises(UnsupportedKind, match="This is not a JPEG"):
         read_photograph(data, "image/jpeg")
 
 
