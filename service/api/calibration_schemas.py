@@ -2,7 +2,7 @@
 
 from dataclasses import asdict
 from datetime import datetime
-from typing import Annotated, Literal, Self
+from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -14,10 +14,10 @@ from service.calibration.look import Exposure, Look
 from service.calibration.report import Method, Role
 from service.calibration.target import CircleGrid, Kind
 from service.errors import BadRequest
+from service.inference.frame import FocalLengthFrom
 from service.storage.calibrations import CalibrationRecord, State
 
 SETTINGS_FIELD = "settings"
-FocalLengthFrom = Literal["camera", "exif"]
 
 Circles = Annotated[int, Field(ge=2, le=40)]
 Millimetres = Annotated[float, Field(gt=0, le=1_000, allow_inf_nan=False)]

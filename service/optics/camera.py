@@ -11,6 +11,7 @@ RANGE_DEPTH_ERROR = 0.1
 ASPECT_TOLERANCE = 0.01
 F_NUMBERS = (0.5, 1_000.0)  # in air, light from a half space is the least; the fastest lens that was made is f/0.7
 FOCUS_DISTANCES_M = (0.001, 100_000.0)  # that can be told; the farthest stands for infinity
+AS_INFINITY_M = 50.0  # from where on no ring has a figure but that of infinity
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +134,12 @@ class Camera:
         """Nearest and farthest depth where 0.25 px of blur error moves the depth by less than 10 %."""
         far = thin_lens.farthest_depth(self.focus_distance_m, self.k_cam_px, RANGE_BLUR_ERROR_PX, RANGE_DEPTH_ERROR)
         return min(self.focal_length_m or 0.0, far), far
+
+    @property
+    def middle_m(self) -> float:
+        """What a curve of blur is drawn around: the plane in focus, or the range's end if that is all but infinity."""
+        focus_m = self.focus_distance_m
+        return min(focus_m, self.range_m[1]) if focus_m >= AS_INFINITY_M else focus_m
 
     def is_same_frame(self, width_px: int, height_px: int) -> bool:
         """Whether an image of this size can be this camera's whole frame, resized (same aspect to 1 %)."""
