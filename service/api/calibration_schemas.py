@@ -15,7 +15,7 @@ from service.calibration.report import Method, Role
 from service.calibration.target import CircleGrid, Kind
 from service.errors import BadRequest
 from service.inference.frame import FocalLengthFrom
-from service.storage.calibrations import CalibrationRecord, State
+from service.storage.calibrations import State
 
 SETTINGS_FIELD = "settings"
 
@@ -204,6 +204,8 @@ class LookRead(BaseModel):
 class CalibrationItem(BaseModel):
     """A calibration in a list."""
 
+    model_config = ConfigDict(from_attributes=True, serialize_by_alias=True)
+
     id: str
     camera: Name
     state: Annotated[State, Field(description="The last three are final")]
@@ -226,16 +228,9 @@ class CalibrationPage(BaseModel):
 class CalibrationRead(CalibrationItem):
     """A calibration: how far it is, what each photograph gave so far, and the result once it has succeeded."""
 
-    model_config = ConfigDict(serialize_by_alias=True)
-
     settings: CalibrationSettings
     images: Annotated[list[ImageRead], Field(description="The photographs looked at so far")]
     result: ResultRead | None
-
-    @classmethod
-    def from_record(cls, record: CalibrationRecord) -> Self:
-        """The stored calibration."""
-        return cls.model_validate(record, from_attributes=True)
 
 
 def _in_field(fault: dict[str, object]) -> dict[str, object]:
