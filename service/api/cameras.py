@@ -259,15 +259,14 @@ def _is_at_hand(revision: int, if_none_match: str | None) -> bool:
 
 
 def _curve(camera: Camera, near_m: float, far_m: float, points: int) -> list[CurvePoint]:
-    depths = [near_m + (far_m - near_m) * step / (points - 1) for step in range(points)]
-    return [_curve_point(camera, depth_m) for depth_m in depths]
-
-
-def _curve_point(camera: Camera, depth_m: float) -> CurvePoint:
     focus_m, k_cam_px = camera.focus_distance_m, camera.k_cam_px
-    return CurvePoint(
-        depth_m=depth_m,
-        blur_px=camera.blur_px(depth_m),
-        defocus_px=thin_lens.defocus_at_depth(depth_m, focus_m, k_cam_px),
-        depth_error_m=thin_lens.depth_error(depth_m, focus_m, k_cam_px, RANGE_BLUR_ERROR_PX),
-    )
+    depths = (near_m + (far_m - near_m) * step / (points - 1) for step in range(points))
+    return [
+        CurvePoint(
+            depth_m=depth_m,
+            blur_px=camera.blur_px(depth_m),
+            defocus_px=thin_lens.defocus_at_depth(depth_m, focus_m, k_cam_px),
+            depth_error_m=thin_lens.depth_error(depth_m, focus_m, k_cam_px, RANGE_BLUR_ERROR_PX),
+        )
+        for depth_m in depths
+    ]
