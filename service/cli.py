@@ -15,14 +15,7 @@ import typer
 from sqlalchemy import Engine
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.config import (
-    DATABASE_FILE,
-    Settings,
-    SettingsError,
-    StorageSettings,
-    load_settings,
-    load_storage_settings,
-)
+from service.config import DATABASE_FILE, Settings, SettingsError, StorageSettings, load_settings, load_storage_settings
 from service.errors import BadRequest, CamindError, Conflict, NotFound
 from service.memory import end_uncollected, lasting
 from service.optics.camera import FOCUS_DISTANCES_M

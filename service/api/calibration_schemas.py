@@ -4,7 +4,7 @@ from dataclasses import asdict
 from datetime import datetime
 from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
 
 from service.api.cursors import NextCursor
 from service.api.problems import invalid_request
@@ -22,6 +22,12 @@ SETTINGS_FIELD = "settings"
 Circles = Annotated[int, Field(ge=2, le=40)]
 Millimetres = Annotated[float, Field(gt=0, le=1_000, allow_inf_nan=False)]
 Utc = Annotated[datetime, Field(description="UTC")]
+EXAMPLE: dict[str, JsonValue] = {
+    "pattern": {"kind": "asymmetric_circles", "rows": 11, "columns": 4, "spacing_mm": 20.0, "diameter_mm": 12.0},
+    "focus_distance_m": None,
+    "method": "edge",
+    "register": True,
+}
 
 
 class Pattern(Given):
@@ -37,25 +43,7 @@ class Pattern(Given):
 class CalibrationSettings(Given):
     """What to look for in the photographs, and what to do with what is found."""
 
-    model_config = ConfigDict(
-        serialize_by_alias=True,
-        json_schema_extra={
-            "examples": [
-                {
-                    "pattern": {
-                        "kind": "asymmetric_circles",
-                        "rows": 11,
-                        "columns": 4,
-                        "spacing_mm": 20.0,
-                        "diameter_mm": 12.0,
-                    },
-                    "focus_distance_m": None,
-                    "method": "edge",
-                    "register": True,
-                }
-            ]
-        },
-    )
+    model_config = ConfigDict(serialize_by_alias=True, json_schema_extra={"examples": [EXAMPLE]})
 
     pattern: Pattern
     focus_distance_m: Annotated[

@@ -183,13 +183,7 @@ LENS_EXAMPLE: dict[str, JsonValue] = {
     "image_height_px": 432,
     "focus_distance_m": 2.0,
     "gamma_px": 0.5,
-    "lens": {
-        "focal_length_mm": 35,
-        "f_number": 2.8,
-        "pixel_pitch_um": 6.05,
-        "sensor_width_px": 3872,
-        "k_r": 4.0,
-    },
+    "lens": {"focal_length_mm": 35, "f_number": 2.8, "pixel_pitch_um": 6.05, "sensor_width_px": 3872, "k_r": 4.0},
 }
 
 
