@@ -109,6 +109,7 @@ class Examiner:
             depth_defocus=defocus,
             blur=blur,
             sides=_sides(case, told) if case.side == "auto" else None,
+            warnings=told.warnings,
         )
         every = max(1, max(case.truth_m.shape) // EXAMPLE_PX)
         shown = (slice(None, None, every),) * 2
@@ -179,12 +180,13 @@ def _sides(case: Case, told: DepthMap) -> Sides:
 
 @dataclass(slots=True)
 class _Examined:
-    """One model's outcomes of a set by mode, and its first picture."""
+    """One model's outcomes of a set by mode, its first picture, and by warning the pictures that have it."""
 
     name: str
     outcomes: dict[str, list[Outcome]] = field(default_factory=dict)
     searched: dict[float, list[Outcome]] = field(default_factory=dict)
     example: Example | None = None
+    warnings: dict[str, list[str]] = field(default_factory=dict)
 
     def take(self, examiner: Examiner, case: Case, scored_set: EvaluationSet) -> None:
         """Have the model answer one more picture, in all modes of the set."""
@@ -192,6 +194,8 @@ class _Examined:
             outcome, example = examiner.answer(case, mode)
             self.outcomes.setdefault(mode, []).append(outcome)
             self.example = self.example or example
+            for warning in outcome.warnings if mode == TRUE_CAMERA else ():
+                self.warnings.setdefault(warning, []).append(case.name)
         for factor in scored_set.factors:
             is_known = factor == 1 and TRUE_CAMERA in scored_set.modes
             camera = with_k_cam_times(factor, case.camera)
@@ -282,4 +286,5 @@ def _reported(model: str, done: Sequence[_Examined]) -> Report:
         blur=[row for name, pixels in blur_pixels.items() for row in blur_ranges(name, pixels)],
         blur_pixels=blur_pixels,
         examples=examples,
+        warnings={e.name: e.warnings for e in done},
     )

@@ -319,6 +319,11 @@ def photographed_folders(data: Path) -> list[Path]:
     return folders
 
 
+def is_own(name: str) -> bool:
+    """Whether a set of this name is of a user's own pictures."""
+    return name.split()[0] not in (*FOLDERS, *TAKEN_NAMES)
+
+
 def _set(name: str, source: CaseSource, *further_modes: str) -> EvaluationSet:
     return EvaluationSet(name, partial(_enough, source), (TRUE_CAMERA, *further_modes))
 

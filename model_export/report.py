@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from model_export.datasets.photos import write_image
-from model_export.evaluation_sets import FIXED, VIEWS
+from model_export.evaluation_sets import FIXED, VIEWS, is_own
 from model_export.modes import MODES, TRUE_CAMERA, UNSEEN_K_CAM_PX
 from model_export.summary import EQUAL_BLUR_PX, EQUAL_DEFOCUS, KEPT_SHARES, BlurRange, Pixels, Report, Summary
 from service.inference.preview import render_preview
@@ -39,6 +39,7 @@ RELIEF_HEAD = ["set", "camera", "true spread of ln z", "of it answered", "correl
 SCORES_HEAD = ["set", "camera", "over", "AbsRel", "MSE", "RMSE", "log10", "delta1", "delta2", "delta3"]
 BESIDE_HEAD = ["set", "AbsRel", "of the other", "times", "pooled RMSE", "of the other", "times"]
 BLUR_HEAD = ["scenes", "lambda px", "pixels", "median error", "certain half", "90th percentile", "bias", "order"]
+WARNINGS_HEAD = ["set", "pictures", "such as", "warning"]
 NOMINAL = np.linspace(0.05, 0.95, 19)
 BINS = 16
 LEAST_IN_BIN = 50
@@ -81,8 +82,15 @@ def _blur_row(b: BlurRange) -> list[str]:
     return [b.name, span, f"{b.pixels:,}", *(f"{v:.1%}" for v in shares), f"{b.bias:+.1%}", f"{b.order:.2f}"]
 
 
+def _warning_rows(report: Report) -> list[list[str]]:
+    """What the answers to a user's own pictures warn of."""
+    own = {name: warnings for name, warnings in report.warnings.items() if is_own(name)}
+    return [[name, str(len(of)), of[0], said] for name, warnings in own.items() for said, of in warnings.items()]
+
+
 def tables(report: Report) -> dict[str, Table]:
     """Title to head and rows, as text."""
+    warnings = _warning_rows(report)
     return {
         "Depth": (DEPTH_HEAD, [_depth_row(s) for s in report.sets]),
         "Certainty": (CERTAINTY_HEAD, [_certainty_row(s) for s in report.sets if s.mode == TRUE_CAMERA]),
@@ -90,6 +98,7 @@ def tables(report: Report) -> dict[str, Table]:
         "Depth differences within a picture": (RELIEF_HEAD, [row for s in report.sets for row in _relief_rows(s)]),
         "All scores of depth": (SCORES_HEAD, [row for s in report.sets for row in _score_rows(s)]),
         "Blur": (BLUR_HEAD, [_blur_row(b) for b in report.blur]),
+        **({"Warnings": (WARNINGS_HEAD, warnings)} if warnings else {}),
     }
 
 

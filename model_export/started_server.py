@@ -8,7 +8,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +18,7 @@ CAMIND = Path(sys.executable).parent / "camind"
 START_S = 60
 ANSWER_S = 300
 T = TypeVar("T")
+Body = bytes | str | Iterable[bytes] | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +38,7 @@ def ask_over(
     connection: http.client.HTTPConnection,
     method: str,
     path: str,
-    body: bytes | str | None = None,
+    body: Body = None,
     headers: dict[str, str] | None = None,
 ) -> Reply:
     """One request over a connection that stays open."""
@@ -85,9 +86,7 @@ class Server:
     def connect(self) -> socket.socket:
         return socket.create_connection(("127.0.0.1", self.port), timeout=10)
 
-    def ask(
-        self, method: str, path: str, body: bytes | str | None = None, headers: dict[str, str] | None = None
-    ) -> Reply:
+    def ask(self, method: str, path: str, body: Body = None, headers: dict[str, str] | None = None) -> Reply:
         """One request over a connection of its own."""
         with closing(self.keep_connection()) as connection:
             return ask_over(connection, method, path, body, headers)

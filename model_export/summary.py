@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,7 +121,7 @@ class Outcome:
     """What one picture scored, what the best constant depth would have, and the share of scored pixels answered.
 
     ``depth_blur_px`` and ``depth_defocus`` are lambda and |x| of the pixels of ``depth``. ``sides`` is None where the
-    side was told.
+    side was told; ``warnings`` are the answer's.
     """
 
     scores: Scores
@@ -134,6 +134,7 @@ class Outcome:
     depth_defocus: Map
     blur: Pixels | None
     sides: Sides | None
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,13 +210,14 @@ class Example:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Everything one evaluation found."""
+    """Everything one evaluation found; ``warnings``: of each set, the pictures by what their answers warn of."""
 
     model: str
     sets: list[Summary]
     blur: list[BlurRange]
     blur_pixels: dict[str, Pixels]
     examples: dict[str, Example]
+    warnings: dict[str, dict[str, list[str]]] = field(default_factory=dict)
 
     def summary(self, name: str, mode: str = TRUE_CAMERA) -> Summary:
         """Raises ``KeyError`` for a set that was not scored."""
@@ -226,7 +228,8 @@ class Report:
 
     def as_dict(self) -> dict[str, object]:
         ranges = [asdict(b) | {"high_px": b.high_px if math.isfinite(b.high_px) else None} for b in self.blur]
-        return {"model": self.model, "sets": [s.as_dict() for s in self.sets], "blur": ranges}
+        sets = [s.as_dict() for s in self.sets]
+        return {"model": self.model, "sets": sets, "blur": ranges, "warnings": self.warnings}
 
     def scores(self) -> dict[str, float]:
         """What the manifest keeps, by ``set.score``, in the mode where the camera is known."""

@@ -70,8 +70,8 @@ def serve(
 ) -> None:
     """Answer requests until stopped. Everything else is set by CAMIND_* variables.
 
-    Exit codes: 0 after SIGTERM, SIGINT or SIGHUP, once what was asked is answered; 143 or 130 where a second one did
-    not wait for that; 1 where it cannot start (the address, the model, the database); 2 for a wrong setting.
+    Exit codes: 0 after SIGTERM, SIGINT or SIGHUP, once what was asked is answered; 143, 130 or 129 where a second one
+    did not wait for that; 1 where it cannot start (the address, the model, the database); 2 for a wrong setting.
     """
     _end_in_order(0)
     settings = _settings(host=host, port=port, model_dir=model)
@@ -616,6 +616,8 @@ def _plain_failures(code: int = 1) -> Iterator[None]:
     try:
         yield
     except SQLAlchemyError as exc:
+        if isinstance(exc.__context__, SystemExit):
+            raise exc.__context__ from None  # a signal came amid a statement, which is not the database's fault
         raise _failure(f"The database cannot be used: {_reason(exc)}", code) from exc
     except BrokenPipeError:
         raise  # whoever read what is printed has enough

@@ -156,13 +156,14 @@ class Settings(StorageSettings):
     ] = 1_000_000_000
     calibration_queue_size: Annotated[int, Field(ge=1, le=1_000, description="Calibrations that may wait")] = 8
     calibration_receive_deadline_s: Annotated[
-        float, Field(gt=0, le=3_600, description="Longest time for the body of a calibration")
+        float, Field(gt=0, le=3_600, description="Longest time for a calibration's body slower than 32 kB/s")
     ] = 600.0
     max_json_bytes: Annotated[
         int, Field(ge=1_000, le=10_000_000, description="Largest request body without an image")
     ] = 64_000
     receive_deadline_s: Annotated[
-        float, Field(gt=0, le=600, description="Longest time for a request's headers, and for its body")
+        float,
+        Field(gt=0, le=600, description="Longest time for a request's headers, and for a body slower than 32 kB/s"),
     ] = 30.0
 
     drain_s: Annotated[

@@ -141,6 +141,8 @@ def _made(photograph: Path, errand: Errand, estimator: Estimator, cancellation: 
             _write(file, bodies[form])
     except (CamindError, OSError) as exc:
         return Made(remarks=str(exc))
+    except MemoryError:
+        return Made(remarks="there is too little memory for it")
     return Made(DepthRead.model_validate_json(bodies[JSON]), answer.camera.focus_distance_m, "; ".join(answer.warnings))
 
 

@@ -28,6 +28,7 @@ def configure(level: str, style: Literal["console", "json"]) -> None:
     root = logging.getLogger()
     root.handlers = [handler]
     root.setLevel(level.upper())
+    logging.captureWarnings(True)  # of Python's own
     logging.getLogger("alembic").setLevel(logging.WARNING)
 
 

@@ -28,6 +28,7 @@ REQUEST_ID = "X-Request-Id"
 SANE_REQUEST_ID = re.compile(r"[A-Za-z0-9._:-]{1,128}")
 CLIENT_GONE = 499
 WITH_BODY = ("POST", "PUT")
+LEAST_BYTES_PER_S = 32_000  # of a body that may take longer than its deadline: a quarter of a megabit
 
 log = structlog.stdlib.get_logger("camind.request")
 
@@ -195,7 +196,7 @@ class EndConnections:
 
 @dataclass(frozen=True, slots=True)
 class BodyLimits:
-    """The most bytes a body may have, and the longest it may take to arrive."""
+    """The most bytes a body may have, and the longest it may take to arrive where it is slower than the least rate."""
 
     max_bytes: int
     deadline_s: float
@@ -228,13 +229,17 @@ class LimitRequests:
 
 
 class _LimitedBody:
-    """``receive`` with a count and a clock; both end with the body, for later messages mean a disconnect."""
+    """``receive`` with a count and a clock; both end with the body, for later messages mean a disconnect.
+
+    The clock starts anew whenever as much has come as the least rate brings in that time: a slow line gets through, who
+    sends a byte now and then, or stops, is cut at the deadline.
+    """
 
     def __init__(self, receive: Receive, limits: BodyLimits) -> None:
         self._receive = receive
         self._limits = limits
-        self._ends_at_s = time.monotonic() + limits.deadline_s
         self._received = 0
+        self._start_clock()
         self._is_whole = False
 
     async def __call__(self) -> Message:
@@ -244,12 +249,19 @@ class _LimitedBody:
             async with asyncio.timeout(self._ends_at_s - time.monotonic()):
                 message = await self._receive()
         except TimeoutError as exc:
-            raise ReceiveTimeout(f"The request body did not arrive within {self._limits.deadline_s:g} s.") from exc
+            least = f"less than {LEAST_BYTES_PER_S // 1000} kB/s for {self._limits.deadline_s:g} s"
+            raise ReceiveTimeout(f"The request body came too slowly: {least}.") from exc
         self._received += len(message.get("body", b""))
         self._is_whole = not message.get("more_body", False)
+        if self._received >= self._enough:
+            self._start_clock()
         if self._received > self._limits.max_bytes:
             raise _too_large(self._limits.max_bytes)
         return message
+
+    def _start_clock(self) -> None:
+        self._ends_at_s = time.monotonic() + self._limits.deadline_s
+        self._enough = self._received + LEAST_BYTES_PER_S * self._limits.deadline_s
 
 
 def _too_large(limit: int) -> TooLarge:

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import pytest
 import typer
-from sqlalchemy import update
+from sqlalchemy import Engine, event, update
 from sqlmodel import col
 from typer.testing import CliRunner, Result
 
@@ -65,6 +65,20 @@ def test_seeds_are_stored_once_and_listed(own_folder: Path) -> None:
 def test_migrate_says_where_the_database_is_however_it_is_served() -> None:
     done = at_once("migrate", CAMIND_PORT="http", CAMIND_WORKERS="64", CAMIND_INTRA_OP_THREADS="64")
     assert (done.exit_code, done.stdout) == (0, f"The database is at {schema.head_revision()}.\n")
+
+
+@pytest.mark.usefixtures("own_folder")
+def test_a_signal_amid_a_migration_is_no_fault_of_the_database() -> None:
+    def end(*heard: object) -> None:
+        if str(heard[2]).startswith("INSERT INTO _alembic_tmp"):
+            sys.exit(7)
+
+    event.listen(Engine, "before_cursor_execute", end)
+    try:
+        done = at_once("migrate")
+    finally:
+        event.remove(Engine, "before_cursor_execute", end)
+    assert (done.exit_code, done.stderr) == (7, "")
 
 
 def test_a_backup_of_nothing_says_where_it_looked_and_makes_nothing(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from tests.inference.photographs import corners, png
 
 JSON = {"Content-Type": "application/json"}
 DISK_BYTES = 2**20
-# with room for what one calibration holds, but not for all of them
+# with room for what one calibration holds, but not for a copy of all of them
 PRUNED_IN_LITTLE_ROOM = """
 import os, sys
 from contextlib import suppress
@@ -47,7 +47,7 @@ with suppress(OSError), ballast.open("ab", buffering=0) as file:
 try:
     calibrations.forget(datetime.now(UTC))
 except InsufficientStorage:
-    os.truncate(ballast, ballast.stat().st_size - 100_000)
+    os.truncate(ballast, ballast.stat().st_size - 50_000)
     print(calibrations.forget(datetime.now(UTC)))
 """
 OWN_NAMESPACE = ("unshare", "--mount", "--map-root-user")

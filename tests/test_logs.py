@@ -1,6 +1,8 @@
 """The log as it is shown."""
 
 import io
+import json
+import subprocess
 import sys
 
 import pytest
@@ -24,3 +26,12 @@ def test_colours_are_a_terminal_s_where_they_are_wanted(
     monkeypatch.delenv("FORCE_COLOR", raising=False)
     *_, render = logs._rendered("console")
     assert ("\x1b" in str(render(None, "info", {"event": "asked", "level": "info"}))) == is_coloured
+
+
+def test_a_warning_of_python_s_is_an_event_too() -> None:
+    warning = "import warnings; from service import logs; logs.configure('info', 'json'); warnings.warn('two\\nlines')"
+    done = subprocess.run([sys.executable, "-c", warning], capture_output=True, text=True, check=True)
+    (line,) = done.stderr.splitlines()
+    event = json.loads(line)
+    assert (event["level"], event["logger"]) == ("warning", "py.warnings")
+    assert "two\nlines" in event["event"]

@@ -86,7 +86,9 @@ def fulfil(cancellation: Cancellation, order: Order, estimator: Estimator) -> An
     seen = () if PROJECTED.isdisjoint(order.formats) else maybe_seen_otherwise(camera, known_at_m)
     for point in known:
         pixel_at(point.u, point.v, whole, "known")
-    depth_map = estimator.estimate(photograph.rgb, camera, order.query.side, cancellation, order.query.part, known)
+    depth_map = estimator.estimate(
+        photograph.rgb, camera, order.query.side, cancellation, order.query.part, known, photograph.hidden
+    )
     stopwatch.add(depth_map.timings_ms)
     warnings = (*order.warnings, *photograph.warnings, *taken, *specs, *shown, *seen, *resized, *depth_map.warnings)
     origin = _origin_of(order, whole, estimator.manifest.name, depth_map.camera, warnings)

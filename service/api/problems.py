@@ -134,10 +134,10 @@ EXAMPLES = {
         "No format fits this Accept header: ask for one of image/png, application/x-npy, application/x-npz, "
         "image/tiff, application/x-ply, image/jpeg, application/json."
     ),
-    "receive-timeout": "The request body did not arrive within 30 s.",
+    "receive-timeout": "The request body came too slowly: less than 32 kB/s for 30 s.",
     "busy": "17 requests run or wait, with room for no more: try again later.",
     "not-ready": "The database cannot be used: the service's log says why.",
-    "insufficient-storage": "The database's disk is full and nothing was stored: try again when there is room.",
+    "insufficient-storage": "The database's disk is full and nothing was changed: even to delete takes some room.",
     "internal-error": "Something went wrong here; the log has it under this X-Request-Id.",
 }
 EXAMPLE_FAULTS = {

@@ -68,13 +68,13 @@ class _Request:
     border: Mask | None = None
     warnings: tuple[str, ...] = ()
 
-    def without_border(self) -> Self:
-        """The same of what is seen, continued into a black border."""
-        border = black_border(self.rgb)
-        if border is None:
+    def without(self, hidden: Mask | None, name: str) -> Self:
+        """The same of what is seen, continued into what shows nothing."""
+        if hidden is None:
             return self
-        said = f"a black border, {fraction(border):.0%} of the photograph, shows nothing: no answer there"
-        return replace(self, rgb=continued(self.rgb, border), border=border, warnings=(said,))
+        said = f"{name}, {fraction(hidden):.0%} of the photograph, shows nothing: no answer there"
+        border = hidden if self.border is None else self.border | hidden
+        return replace(self, rgb=continued(self.rgb, hidden), border=border, warnings=(*self.warnings, said))
 
     def area(self, scale: float, multiple: int) -> Part:
         """What a copy of this scale shows: the photograph, or the part and what the copy needs around it.
@@ -126,20 +126,23 @@ class Estimator:
         cancellation: Cancellation | None = None,
         part: Part | None = None,
         known: Sequence[KnownDepth] = (),
+        hidden: Mask | None = None,
     ) -> DepthMap:
         """Depth of an upright photograph, uint8 [h, w, 3] sRGB, whose camera is at exactly that size.
 
         Of a ``part`` alone it costs what the part and its surroundings cost. Where depths are ``known``, of pixels
         within the photograph, it is first read from one to the other: the answer is then by the camera focused where
         they say, and theirs where they are. Of a photograph that is sharper than the camera's gamma allows, gamma is
-        what it shows; the answer's ``camera`` has it. Raises ``ValueError`` for a camera of another size and
-        ``Cancelled`` when asked to stop.
+        what it shows; the answer's ``camera`` has it. Where it is ``hidden``, bool [h, w], and in a black border there
+        is no answer. Raises ``ValueError`` for a camera of another size and ``Cancelled`` when asked to stop.
         """
         height, width = rgb.shape[:2]
         if (width, height) != (camera.image_width_px, camera.image_height_px):
             raise ValueError(f"the camera must be that of a {width}x{height} image: resize it first")
         asked = _Request(rgb, camera, side, cancellation or Cancellation(), part)
-        request, clues = self._heard(asked.without_border(), known)
+        asked = asked.without(hidden, "what is transparent")
+        asked = asked.without(black_border(asked.rgb), "a black border")
+        request, clues = self._heard(asked, known)
         request, read = self._read_sharp(request)
         area, stopwatch = read.area, request.stopwatch
         size = (area.height_px, area.width_px)

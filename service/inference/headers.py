@@ -20,9 +20,11 @@ from service.inference.vp8 import quality as quality_of_vp8
 Kind = Literal["jpeg", "png", "tiff", "webp", "heic", "avif", "raw"]
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-PNG_READ = frozenset({b"IHDR", b"eXIf", b"acTL", b"cICP", b"iCCP", b"sRGB", b"gAMA", b"iTXt"})
+PNG_CLEAR = b"tRNS"  # which of its colours are transparent
+PNG_READ = frozenset({b"IHDR", b"eXIf", b"acTL", b"cICP", b"iCCP", b"sRGB", b"gAMA", b"iTXt", PNG_CLEAR})
+PNG_ALPHA = 4  # in the number of its kind of colours
 PNG_LINEAR = struct.pack(">I", 100_000)  # gamma 1
-PNG_PALETTE = 3
+PNG_GREY, PNG_PALETTE = 0, 3
 PNG_XMP = b"XML:com.adobe.xmp\x00"
 PNG_ANCILLARY = 0x20  # of a chunk's first letter: no part of the picture (ISO/IEC 15948, 5.4)
 EXIF_SIGNATURE = b"Exif\x00\x00"
@@ -31,6 +33,7 @@ ICC_SIGNATURE, ICC_NUMBERING = b"ICC_PROFILE\x00", 2
 # of RAF, ORF, RW2, X3F and CR3
 OTHER_RAW = re.compile(rb"FUJIFILMCCD-RAW|IIR[OS]|MMOR|IIU\0|FOVb|....ftypcrx ", re.DOTALL)
 BIG_TIFF = (b"II+\x00", b"MM\x00+")
+WEBP_CLEAR = 0x10  # of a lossless one's fifth byte: alpha is used
 JPEG_MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
 JPEG_FILL = re.compile(rb"\xff*(?=\xff)")
 JPEG_END, JPEG_SCAN, JPEG_STEPS, JPEG_APP1, JPEG_APP2 = 0xD9, 0xDA, 0xDB, 0xE1, 0xE2
@@ -44,6 +47,8 @@ TIFF_PHOTOMETRIC, TIFF_SUB_DIRECTORIES, TIFF_DNG_VERSION = 262, 330, 50706
 # photometric interpretations of sensor values: a filter array, and the same after demosaicing
 TIFF_SENSOR = frozenset({32803, 34892})
 TIFF_PALETTE = 3
+TIFF_RGB, TIFF_RGBA_SAMPLES = 2, 4
+TIFF_EXTRA_SAMPLES, TIFF_ALPHA = 338, frozenset({1, 2})
 CR2_MARK = b"CR"
 MOST_DIRECTORIES = 16
 TIFF_PROFILE, TIFF_XMP = 34675, 700
@@ -60,7 +65,8 @@ class Header:
 
     Of a tiff or raw file that is the file. ``has_more``: other pages or frames follow. ``curve``: what its values have,
     by H.273's number. ``quality``: of a jpeg or lossy webp, to 100, as most programs count it. ``xmp``: not of
-    heic, avif and raw. ``has_few_colours``: of a palette, or of less than 8 bits.
+    heic, avif and raw. ``has_few_colours``: of a palette, or of less than 8 bits. ``has_alpha``: parts may be
+    transparent; not told of heic and avif.
     """
 
     kind: Kind
@@ -74,6 +80,7 @@ class Header:
     quality: float | None = None
     xmp: bytes = b""
     has_few_colours: bool = False
+    has_alpha: bool = False
 
     @property
     def other_curve(self) -> str | None:
@@ -189,7 +196,9 @@ def _png(data: bytes) -> Header:
     exif, frames = found.get(b"eXIf", b""), int.from_bytes(found.get(b"acTL", b"")[:4], "big")
     orientation, has_more = exif_orientation(exif), frames > 1
     few, curve = bits < 8 or colours == PNG_PALETTE, _png_curve(found)
-    return Header("png", width, height, orientation, None, exif, has_more, curve, xmp=xmp, has_few_colours=few)
+    clear = colours & PNG_ALPHA or (colours != PNG_GREY and PNG_CLEAR in found)  # its decoder knows no other
+    header = Header("png", width, height, orientation, None, exif, has_more, curve, xmp=xmp)
+    return replace(header, has_few_colours=few, has_alpha=bool(clear))
 
 
 def _png_curve(found: dict[bytes, bytes]) -> int:
@@ -226,7 +235,8 @@ def _png_places(data: bytes) -> Iterator[tuple[bytes, int, int]]:
 def picture_of_png(data: bytes) -> bytes:
     """A png that ``read_header`` takes without all that its decoder would unpack, and tell the log, for nothing."""
     places = _png_places(data)
-    return PNG_SIGNATURE + b"".join(data[at:end] for name, at, end in places if not name[0] & PNG_ANCILLARY)
+    kept = (data[at:end] for name, at, end in places if not name[0] & PNG_ANCILLARY or name == PNG_CLEAR)
+    return PNG_SIGNATURE + b"".join(kept)
 
 
 def _webp(data: bytes) -> Header:
@@ -237,6 +247,7 @@ def _webp(data: bytes) -> Header:
     exif = profile = xmp = b""
     quality: float | None = None
     frames = 0
+    clear = False
     at = 12
     for _ in range(MOST_PARTS):
         if at > length:
@@ -244,6 +255,7 @@ def _webp(data: bytes) -> Header:
         name, chunk = struct.unpack_from("<4sI", data, at)
         size = size or _webp_size(name, data[at + 8 : at + 18])
         frames += name == b"ANMF"
+        clear |= name == b"ALPH" or (name == b"VP8L" and bool(data[at + 12] & WEBP_CLEAR))
         if name == b"EXIF":
             exif = data[at + 8 : at + 8 + chunk].removeprefix(EXIF_SIGNATURE)
         elif name == b"ICCP":
@@ -258,7 +270,7 @@ def _webp(data: bytes) -> Header:
     if size is None:
         raise InvalidImage("The webp file holds no picture.")
     curve, orientation = curve_of_profile(profile), exif_orientation(exif)
-    return Header("webp", *size, orientation, None, exif, frames > 1, curve, quality, xmp)
+    return Header("webp", *size, orientation, None, exif, frames > 1, curve, quality, xmp, has_alpha=clear)
 
 
 def _webp_size(name: bytes, payload: bytes) -> tuple[int, int] | None:
@@ -289,8 +301,14 @@ def _tiff(data: bytes) -> Header:
     at = directory.offset_of(ORIENTATION)
     has_more, curve = _has_more_pages(data, directory), curve_of_profile(directory.bytes_of(TIFF_PROFILE))
     xmp, few = directory.bytes_of(TIFF_XMP), TIFF_PALETTE in directory.values(TIFF_PHOTOMETRIC)
-    size, orientation = directory.size, directory.orientation
-    return Header("tiff", *size, orientation, at, data, has_more, curve, xmp=xmp, has_few_colours=few)
+    size, orientation, clear = directory.size, directory.orientation, _has_alpha(directory)
+    return Header("tiff", *size, orientation, at, data, has_more, curve, xmp=xmp, has_few_colours=few, has_alpha=clear)
+
+
+def _has_alpha(directory: TiffDirectory) -> bool:
+    is_rgba = len(directory.values(TIFF_BITS)) == TIFF_RGBA_SAMPLES and TIFF_RGB in directory.values(TIFF_PHOTOMETRIC)
+    is_interleaved = 2 not in directory.values(TIFF_PLANAR)
+    return is_rgba and is_interleaved and not TIFF_ALPHA.isdisjoint(directory.values(TIFF_EXTRA_SAMPLES))
 
 
 def _require_usual(directory: TiffDirectory) -> None:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from service import PIXEL_CEILING
 from service.config import Settings
 from service.errors import InvalidImage, TooLarge, UnsupportedKind
+from service.inference.border import Mask
 from service.inference.exif import Exif, read_exif
 from service.inference.headers import Header, Kind, picture_of_png, read_header
 from service.inference.isolated import decode_isolated
@@ -87,9 +88,9 @@ CLIPPED_LEVEL, CLIPPED_SHARE, CLIPPED_EVERY = 253, 0.25, 4  # of all colours; of
 class ImageLimits:
     """The most that is accepted: bytes of the file, pixels of the picture, and its longer side over its shorter."""
 
-    max_bytes: int = 32 * 2**20
-    max_pixels: int = 64_000_000
-    max_aspect: float = 10.0
+    max_bytes: int = Settings.model_fields["max_image_bytes"].default
+    max_pixels: int = Settings.model_fields["max_image_pixels"].default
+    max_aspect: float = Settings.model_fields["max_image_aspect"].default
 
     @classmethod
     def of(cls, settings: Settings) -> Self:
@@ -99,13 +100,17 @@ class ImageLimits:
 
 @dataclass(frozen=True, slots=True)
 class Photograph:
-    """``rgb``: uint8 [height, width, 3], sRGB, upright; ``orientation`` is the EXIF's of the file, 1..8."""
+    """``rgb``: uint8 [height, width, 3], sRGB, upright; ``orientation`` is the EXIF's of the file, 1..8.
+
+    ``hidden``: bool [height, width], where it is more transparent than not; None where that is nowhere.
+    """
 
     rgb: NDArray[np.uint8]
     kind: Kind
     orientation: int
     warnings: tuple[str, ...] = ()
     exif: Exif = field(default_factory=Exif)
+    hidden: Mask | None = None
 
     @property
     def width_px(self) -> int:
@@ -133,11 +138,11 @@ def photographs_in(folder: Path) -> list[Path]:
 def read_photograph(data: bytes, media_type: str | None = None, limits: ImageLimits | None = None) -> Photograph:
     """Decode a photograph; the bytes decide its kind, whatever ``media_type`` declares.
 
-    Raises ``InvalidImage`` (empty, cut off, damaged), ``TooLarge`` (before decoding) and ``UnsupportedKind``
-    (a declared type or bytes that are not listed).
+    Raises ``InvalidImage`` (empty, cut off, damaged), ``TooLarge`` (before decoding), ``UnsupportedKind``
+    (a declared type or bytes that are not listed) and ``MemoryError``.
     """
     declared = declared_kind(media_type)
-    header, stored, warnings = _read(data, limits or ImageLimits())
+    header, stored, hidden, warnings = _read(data, limits or ImageLimits())
     kind, orientation = header.kind, header.orientation
     if declared not in (None, kind):
         warnings += (f"declared {media_type}, read as {kind}",)
@@ -150,8 +155,9 @@ def read_photograph(data: bytes, media_type: str | None = None, limits: ImageLim
         warnings += (f"{said}: send what the camera stored",)
     if header.has_few_colours:
         warnings += ("it has a palette's few colours, whose steps are taken for edges: send what the camera stored",)
-    warnings += (*_overexposed(stored), *signs_of_making(data, header, stored))
-    return Photograph(turned(stored, orientation), kind, orientation, warnings, read_exif(header.exif))
+    warnings += (*_overexposed(stored, hidden), *signs_of_making(data, header, stored))
+    hidden = None if hidden is None else turned(hidden, orientation)
+    return Photograph(turned(stored, orientation), kind, orientation, warnings, read_exif(header.exif), hidden)
 
 
 def read_stored_frame(data: bytes, limits: ImageLimits | None = None) -> StoredFrame:
@@ -159,7 +165,7 @@ def read_stored_frame(data: bytes, limits: ImageLimits | None = None) -> StoredF
 
     Raises as ``read_photograph`` does, and ``UnsupportedKind`` for light that would be measured by a wrong curve.
     """
-    header, stored, _ = _read(data, limits or ImageLimits())
+    header, stored, _, _ = _read(data, limits or ImageLimits())
     if header.other_curve is not None:
         raise UnsupportedKind(f"Its colour profile is {header.other_curve}: export it as sRGB, to be measured.")
     return StoredFrame(stored, header.orientation, read_exif(header.exif))
@@ -190,8 +196,8 @@ def declared_kind(media_type: str | None) -> Kind | None:
     return kind
 
 
-def _read(data: bytes, limits: ImageLimits) -> tuple[Header, NDArray[np.uint8], tuple[str, ...]]:
-    """The header, the stored frame, and warnings of how it was decoded."""
+def _read(data: bytes, limits: ImageLimits) -> tuple[Header, NDArray[np.uint8], Mask | None, tuple[str, ...]]:
+    """The header, the stored frame, where it is hidden, and warnings of how it was decoded."""
     if len(data) > limits.max_bytes:
         raise TooLarge(f"The file has {len(data)} bytes, more than the {limits.max_bytes} accepted.")
     header = read_header(data)
@@ -200,7 +206,8 @@ def _read(data: bytes, limits: ImageLimits) -> tuple[Header, NDArray[np.uint8], 
         return header, *_decode(data, header)
     stored = decode_isolated(header.kind, data, min(limits.max_pixels, PIXEL_CEILING))
     _require_size(stored.shape[1], stored.shape[0], limits)
-    return header, stored if header.kind == "raw" else _stored_pixels(stored, header), ()
+    stored, hidden = _without_alpha(stored if header.kind == "raw" else _stored_pixels(stored, header))
+    return header, stored, hidden, ()
 
 
 def _require_size(width_px: int, height_px: int, limits: ImageLimits) -> None:
@@ -211,15 +218,27 @@ def _require_size(width_px: int, height_px: int, limits: ImageLimits) -> None:
         raise TooLarge(f"The picture has {width_px}x{height_px} pixels, more than {limits.max_aspect:g} to 1.")
 
 
-def _decode(data: bytes, header: Header) -> tuple[NDArray[np.uint8], tuple[str, ...]]:
+def _decode(data: bytes, header: Header) -> tuple[NDArray[np.uint8], Mask | None, tuple[str, ...]]:
+    flags = cv2.IMREAD_UNCHANGED if header.has_alpha else DECODE_FLAGS
     try:
-        pixels = cv2.imdecode(np.frombuffer(_picture(data, header), np.uint8), DECODE_FLAGS)
+        pixels = cv2.imdecode(np.frombuffer(_picture(data, header), np.uint8), flags)
     except cv2.error as exc:
+        if exc.code == cv2.Error.StsNoMem:
+            raise MemoryError(exc.err) from exc
         raise InvalidImage(f"The {header.kind} file cannot be decoded: it is damaged.") from exc
     if pixels is None or pixels.shape[:2] != (header.height_px, header.width_px):
         raise InvalidImage(f"The {header.kind} file cannot be decoded: it is damaged or of an unusual form.")
-    eight_bits, warnings = _eight_bits(pixels)
-    return np.asarray(cv2.cvtColor(eight_bits, cv2.COLOR_BGR2RGB), np.uint8), warnings
+    colours, hidden = _without_alpha(pixels)
+    eight_bits, warnings = _eight_bits(colours)
+    return np.asarray(cv2.cvtColor(eight_bits, cv2.COLOR_BGR2RGB), np.uint8), hidden, warnings
+
+
+def _without_alpha(pixels: NDArray[Any]) -> tuple[NDArray[Any], Mask | None]:
+    """The colours alone, and where they are hidden: nowhere where all of them were, as by a sensor's unused channel."""
+    if pixels.ndim != 3 or pixels.shape[2] != 4:
+        return pixels, None
+    hidden = pixels[..., 3] <= np.iinfo(pixels.dtype).max // 2
+    return np.ascontiguousarray(pixels[..., :3]), hidden if hidden.any() and not hidden.all() else None
 
 
 def _picture(data: bytes, header: Header) -> bytes:
@@ -234,10 +253,12 @@ def _picture(data: bytes, header: Header) -> bytes:
     return bytes(stored)
 
 
-def _overexposed(pixels: NDArray[np.uint8]) -> Iterator[str]:
+def _overexposed(pixels: NDArray[np.uint8], hidden: Mask | None) -> Iterator[str]:
     """A warning where much of a picture is white, whose blur is lost and misleads what is beside it."""
-    red, green, blue = np.moveaxis(pixels[::CLIPPED_EVERY, ::CLIPPED_EVERY], 2, 0)
-    share = float(((red >= CLIPPED_LEVEL) & (green >= CLIPPED_LEVEL) & (blue >= CLIPPED_LEVEL)).mean())
+    every = (slice(None, None, CLIPPED_EVERY),) * 2
+    red, green, blue = np.moveaxis(pixels[every], 2, 0)
+    white = (red >= CLIPPED_LEVEL) & (green >= CLIPPED_LEVEL) & (blue >= CLIPPED_LEVEL)
+    share = float((white if hidden is None else white & ~hidden[every]).mean())
     if share > CLIPPED_SHARE:
         yield f"{100 * share:.0f} % of it is overexposed, and no blur is seen there: metres may be wrong, beside it too"
 

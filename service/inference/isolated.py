@@ -31,7 +31,7 @@ ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
 def decode_isolated(kind: str, data: bytes, max_pixels: int) -> NDArray[np.uint8]:
-    """The pixels [h, w, 3] RGB of a HEIC, upright, or of an AVIF or raw file, as stored.
+    """The pixels [h, w, 3] RGB, or [h, w, 4] with alpha, of a HEIC, upright, or of an AVIF or raw file, as stored.
 
     Raises ``UnsupportedKind`` without the extra, ``TooLarge``, ``InvalidImage`` and ``Busy``.
     """
@@ -74,14 +74,14 @@ def _hand_over(data: bytes, stream: BufferedWriter) -> None:
 def _answer(stream: BufferedReader, kind: str, max_pixels: int) -> NDArray[np.uint8]:
     """The pixels, and never more bytes than allowed."""
     try:
-        status, width_px, height_px = HEAD.unpack(stream.read(HEAD.size))
+        status, width_px, height_px, channels = HEAD.unpack(stream.read(HEAD.size))
     except struct.error as exc:
         raise InvalidImage(f"The {kind} file was given up: decoding it takes too much time or memory.") from exc
     if status == TOO_LARGE or width_px * height_px > max_pixels:
         raise TooLarge(f"The picture has {width_px}x{height_px} pixels, more than the {max_pixels} accepted.")
-    if status != DECODED:
+    if status != DECODED or channels not in (3, 4):
         raise InvalidImage(f"The {kind} file cannot be decoded: it is cut off or damaged.")
-    pixels = np.empty((height_px, width_px, 3), np.uint8)
+    pixels = np.empty((height_px, width_px, channels), np.uint8)
     if not pixels.size or stream.readinto(pixels.data.cast("B")) != pixels.size:
         raise InvalidImage(f"The {kind} file cannot be decoded: its decoder broke off.")
     return pixels

@@ -1,7 +1,8 @@
 """The program that decodes HEIC, AVIF and raw files, in a process of its own: it imports nothing of the service.
 
 ``python -I isolated_decoder.py KIND MAX_PIXELS MEMORY_BYTES CPU_S`` takes the file on its standard input. Out go a
-status, width and height, and after ``DECODED`` the pixels, 8-bit RGB in sRGB, a HEIC's upright, others as stored.
+status, width, height and channels, and after ``DECODED`` the pixels, 8-bit RGB in sRGB, with alpha where there is any,
+a HEIC's upright, others as stored.
 """
 
 import importlib
@@ -12,10 +13,10 @@ import sys
 from collections.abc import Callable
 from io import BytesIO
 
-HEAD = struct.Struct(">cII")
+HEAD = struct.Struct(">cIIB")
 DECODED, TOO_LARGE, DAMAGED = b"d", b"l", b"x"
 
-Decoded = tuple[int, int, bytes]
+Decoded = tuple[int, int, int, bytes]
 Opened = tuple[int, int, Callable[[], Decoded]]
 
 
@@ -38,6 +39,11 @@ def shut_off() -> None:
     resource.setrlimit(resource.RLIMIT_NOFILE, (0, 0))
 
 
+def with_alpha(mode: str) -> str:
+    """What a picture of this mode is converted to."""
+    return "RGBA" if "A" in mode.upper() else "RGB"
+
+
 def heic(data: bytes) -> Opened:
     """The primary picture of a HEIC: its stated size, and how to decode it."""
     import pi_heif
@@ -49,8 +55,9 @@ def heic(data: bytes) -> Opened:
     picture = pi_heif.open_heif(data, convert_hdr_to_8bit=True)
 
     def decode() -> Decoded:
-        pixels = picture.data if picture.mode == "RGB" else picture.to_pillow().convert("RGB").tobytes()
-        return *picture.size, pixels
+        mode = with_alpha(picture.mode)
+        pixels = picture.data if picture.mode == "RGB" else picture.to_pillow().convert(mode).tobytes()
+        return *picture.size, len(mode), pixels
 
     return *picture.size, decode
 
@@ -65,7 +72,8 @@ def avif(data: bytes) -> Opened:
     picture = AvifImagePlugin.AvifImageFile(BytesIO(data))
 
     def decode() -> Decoded:
-        return *picture.size, picture.convert("RGB").tobytes()
+        mode = with_alpha(picture.mode)
+        return *picture.size, len(mode), picture.convert(mode).tobytes()
 
     return *picture.size, decode
 
@@ -83,7 +91,7 @@ def raw(data: bytes) -> Opened:
         developed = picture.postprocess(
             use_camera_wb=True, no_auto_bright=True, adjust_maximum_thr=0.0, gamma=(2.4, 12.92), user_flip=0
         )
-        return developed.shape[1], developed.shape[0], developed.tobytes()
+        return developed.shape[1], developed.shape[0], 3, developed.tobytes()
 
     return picture.sizes.iwidth, picture.sizes.iheight, decode
 
@@ -99,13 +107,13 @@ def main(kind: str, max_pixels: int, memory_bytes: int, cpu_s: int) -> None:
         try:
             width_px, height_px, decode = DECODERS[kind](sys.stdin.buffer.read())
             if width_px * height_px > max_pixels:
-                out.write(HEAD.pack(TOO_LARGE, width_px, height_px))
+                out.write(HEAD.pack(TOO_LARGE, width_px, height_px, 0))
                 return
-            width_px, height_px, pixels = decode()
+            width_px, height_px, channels, pixels = decode()
         except Exception:
-            out.write(HEAD.pack(DAMAGED, 0, 0))
+            out.write(HEAD.pack(DAMAGED, 0, 0, 0))
             return
-        out.write(HEAD.pack(DECODED, width_px, height_px))
+        out.write(HEAD.pack(DECODED, width_px, height_px, channels))
         out.write(pixels)
 
 

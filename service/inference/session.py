@@ -20,6 +20,7 @@ from service.inference.cancellation import Cancellation, Cancelled
 AWAKE_US = "100"
 LOG_FATAL_ONLY = 4
 GROW_AS_ASKED = 1
+OUT_OF_MEMORY = ("Failed to allocate memory", "bad_alloc")  # in words, for the class of these errors is any failure's
 
 onnxruntime.disable_telemetry_events()
 onnxruntime.create_and_register_allocator(
@@ -62,7 +63,7 @@ class Graph:
     def run(
         self, feeds: Mapping[str, NDArray[np.float32]], cancellation: Cancellation, *, free_memory: bool = False
     ) -> dict[str, NDArray[np.float32]]:
-        """Every output by name; feeds without an input are left out. ``Cancelled`` when asked to stop.
+        """Every output by name; feeds without an input are left out. ``Cancelled`` when asked to stop, ``MemoryError``.
 
         ``free_memory`` gives back, at the end, what no run uses.
         """
@@ -77,5 +78,7 @@ class Graph:
             except Exception as exc:
                 if cancellation.is_set:
                     raise Cancelled from exc
+                if any(sign in str(exc) for sign in OUT_OF_MEMORY):
+                    raise MemoryError(str(exc)) from exc
                 raise
         return dict(zip(self.output_names, values, strict=True))

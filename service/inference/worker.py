@@ -79,7 +79,7 @@ class Worker:
         """Run the work in a slot; cancelling the awaiting task asks the work to stop.
 
         ``line`` is whose it is, None where there is no other. Raises ``Busy`` when the queue is full, the line has its
-        share of it, the deadline passes or the service stops, and whatever the work raises.
+        share of it, the deadline passes, memory is short or the service stops, and whatever the work raises.
         """
         cancellation = self._admit(line)
         future = self._submit(line, cancellation, lambda: work(cancellation, *args, **kwargs))
@@ -95,6 +95,11 @@ class Worker:
             ) from exc
         except Cancelled as exc:
             raise Busy("The service is stopping.") from exc
+        except MemoryError as exc:
+            raise Busy(
+                "There is too little memory for this photograph: try again later or send a smaller one.",
+                retry_after_s=self._retry_after_s(),
+            ) from exc
         finally:
             cancellation.cancel()
 

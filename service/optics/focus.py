@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import groupby, pairwise
 from typing import NamedTuple
 
 from service.optics import thin_lens
@@ -44,7 +45,7 @@ class Sighting:
 
 @dataclass(frozen=True, slots=True)
 class FocusFit:
-    """The likeliest focus distance in metres with its 95 % interval, and gamma over what was told of it.
+    """The focus distance in metres with its 95 % interval, and gamma over what was told of it.
 
     ``deviations`` say by how many of its own each sighting is off both.
     """
@@ -57,23 +58,25 @@ class FocusFit:
 
 
 def fit_focus(camera: Camera, sightings: Sequence[Sighting], is_near: bool | None = None) -> FocusFit:
-    """The focus distance and gamma whose blur (eq. 3 and 5) is nearest to what was read, and near to the camera's own.
+    """The focus distance whose blur (eq. 3 and 5) is near to what was read, and that is near to the camera's own.
 
-    Blur is in pixels of the camera's pictures. A known depth tells its side of focus, so that, other than depth from
-    blur, this has one answer; from a single sighting close to focus the interval holds both, unless it is told whether
-    all of the picture ``is_near``, nearer than what is in focus, or beyond it. Neither is farther from the camera's own
-    than 2.5 times. Raises ``ValueError`` without a sighting.
+    It is the mean of what is likely, gamma the likeliest for it. Blur is in pixels of the camera's pictures. A known
+    depth tells its side of focus, so that, other than depth from blur, this has one answer; from a single sighting
+    close to focus the interval holds both, unless it is told whether all of the picture ``is_near``, nearer than what
+    is in focus, or beyond it. Neither end is farther from the camera's own than 2.5 times. Raises ``ValueError``
+    without a sighting.
     """
     if not sightings:
         raise ValueError("a focus distance is fitted to one known depth or more")
-    search = _Search(camera, sightings, is_near, _Candidate(camera.focus_distance_m, 1.0, math.inf))
+    search = _Search(camera, sightings, is_near)
     search.look(camera.focus_distance_m * ratio for ratio in FOCUS_RATIOS)
     search.look(_suited(camera, sightings))
     search.look_closer()
-    best, (low_m, high_m) = search.best, search.likely_m
-    fitted = replace(camera.focused_at(best.focus_distance_m), gamma_px=camera.gamma_px * best.gamma_ratio)
+    found = search.candidate(search.mean_m)
+    low_m, high_m = search.likely_m
+    fitted = replace(camera.focused_at(found.focus_distance_m), gamma_px=camera.gamma_px * found.gamma_ratio)
     deviations = tuple(abs(seen.deviation(fitted.blur_px(seen.depth_m))) for seen in sightings)
-    return FocusFit(best.focus_distance_m, low_m, high_m, best.gamma_ratio, deviations)
+    return FocusFit(found.focus_distance_m, low_m, high_m, found.gamma_ratio, deviations)
 
 
 class _Candidate(NamedTuple):
@@ -84,43 +87,83 @@ class _Candidate(NamedTuple):
 
 @dataclass(slots=True)
 class _Search:
-    """The likeliest candidate of those looked at, and the possible ones: not much less likely when they were seen."""
+    """The focus distances looked at, each with its likeliest gamma; without end is the loss of what is not likely."""
 
     camera: Camera
     sightings: Sequence[Sighting]
     is_near: bool | None
-    best: _Candidate
-    possible: list[_Candidate] = field(default_factory=list)
+    looked: list[_Candidate] = field(default_factory=list)
+    most: float = math.inf
 
     @property
     def likely_m(self) -> tuple[float, float]:
         """The nearest and the farthest focus distance in the 95 % interval."""
-        most = self.best.loss + CONFIDENCE_95
-        likely_m = [each.focus_distance_m for each in self.possible if each.loss <= most]
+        likely_m = [each.focus_distance_m for each in self.looked if each.loss <= self.most]
         return min(likely_m), max(likely_m)
+
+    @property
+    def likeliest(self) -> list[_Candidate]:
+        """What is in the 95 % interval around the likeliest, without a gap, by distance."""
+        by_likely = groupby(sorted(self.looked), lambda each: each.loss <= self.most)
+        return min((list(run) for _, run in by_likely), key=lambda run: min(each.loss for each in run))
+
+    @property
+    def mean_m(self) -> float:
+        """The mean focus distance of those, by a logarithm's density: on both sides of what is seen to be in focus."""
+        run = self.likeliest
+        seen = [(math.log(each.focus_distance_m), math.exp(run[0].loss - each.loss)) for each in run]
+        area = moment = 0.0
+        for (low, low_density), (high, high_density) in pairwise(seen):
+            area += (high - low) * (low_density + high_density)
+            moment += (high - low) * (low_density * low + high_density * high)
+        return math.exp(moment / area) if area else run[0].focus_distance_m
 
     def look(self, distances_m: Iterable[float]) -> None:
         """Look at those focus distances that the lens can have and that are not too far from what was told."""
         told_m = self.camera.focus_distance_m
         low_m, high_m = max(told_m * FOCUS_RATIOS[-2], self.camera.focal_length_m or 0.0), told_m * FOCUS_RATIOS[-1]
         for focus_m in distances_m:
-            if not low_m < focus_m <= high_m:
-                continue
-            most = self.best.loss + CONFIDENCE_95
-            for candidate in _candidates(self.camera, focus_m, self.sightings, self.is_near, most):
-                self.possible.append(candidate)
-                self.best = min(self.best, candidate, key=lambda each: each.loss)
+            if low_m < focus_m <= high_m:
+                self.looked.append(self.candidate(focus_m, self.most))
+                self.most = min(self.most, self.looked[-1].loss + CONFIDENCE_95)
 
     def look_closer(self) -> None:
         """Look at what is likely in finer steps: where k_cam is large, all of it may lie between two of the first."""
         step = FOCUS_STEP
         for _ in range(MOST_PASSES):
-            low_m, high_m = self.likely_m
+            run = self.likeliest
+            low_m, high_m = run[0].focus_distance_m, run[-1].focus_distance_m
             width = math.log(high_m / low_m)
             if width >= LEAST_STEPS * step:
                 return
             start, step = math.log(low_m) - step, (width + 2 * step) / FINER_STEPS
             self.look(math.exp(start + number * step) for number in range(1, FINER_STEPS))
+
+    def candidate(self, focus_m: float, most: float = math.inf) -> _Candidate:
+        """The camera focused there with the likeliest gamma, if no more than ``most`` is lost."""
+        k_cam_px = self.camera.focused_at(focus_m).k_cam_px
+        seen = [
+            (each.deviation, thin_lens.defocus_at_depth(each.depth_m, focus_m, k_cam_px)) for each in self.sightings
+        ]
+        lost = self._lost_by_place(focus_m, k_cam_px)
+        best = _Candidate(focus_m, 1.0, math.inf)
+        for ratio in GAMMA_RATIOS:
+            gamma_px, loss = self.camera.gamma_px * ratio, lost + (math.log(ratio) / TOLD_GAMMA_ERROR) ** 2 / 2
+            for deviation, sigma_px in seen:
+                if loss >= best.loss or loss > most:
+                    break
+                loss += _loss(deviation(thin_lens.blur_from_defocus(sigma_px, gamma_px)))
+            if loss < best.loss and loss <= most:
+                best = _Candidate(focus_m, ratio, loss)
+        return best
+
+    def _lost_by_place(self, focus_m: float, k_cam_px: float) -> float:
+        """What speaks against that focus distance but for blur: what was told, and sides."""
+        # what is clearly blurred is seen to be out of focus, however little that is of a large k_cam
+        side_error = min(SIDE_ERROR, max(self.camera.gamma_px, LEAST_BLUR_PX) / k_cam_px)
+        off_side = (_off_side(each.depth_m, focus_m, self.is_near) / side_error for each in self.sightings)
+        off_told = math.log(focus_m / self.camera.focus_distance_m) / TOLD_ERROR
+        return _loss(off_told) + sum(map(_loss, off_side))
 
 
 def _suited(camera: Camera, sightings: Sequence[Sighting]) -> Iterator[float]:
@@ -132,28 +175,6 @@ def _suited(camera: Camera, sightings: Sequence[Sighting]) -> Iterator[float]:
         for sigma_px in (defocus_px, -defocus_px):
             if sigma_px * seen.depth_m < k_near:
                 yield seen.depth_m * (k_near - sigma_px * focal_m) / (k_near - sigma_px * seen.depth_m)
-
-
-def _candidates(
-    camera: Camera, focus_m: float, sightings: Sequence[Sighting], is_near: bool | None, most: float
-) -> Iterator[_Candidate]:
-    """The camera focused there with every gamma, but for those with which more than ``most`` is lost."""
-    k_cam_px = camera.focused_at(focus_m).k_cam_px
-    seen = [(each.deviation, thin_lens.defocus_at_depth(each.depth_m, focus_m, k_cam_px)) for each in sightings]
-    off_focus = math.log(focus_m / camera.focus_distance_m) / TOLD_ERROR
-    # what is clearly blurred is seen to be out of focus, however little that is of a large k_cam
-    side_error = min(SIDE_ERROR, max(camera.gamma_px, LEAST_BLUR_PX) / k_cam_px)
-    off_side = (_off_side(each.depth_m, focus_m, is_near) / side_error for each in sightings)
-    lost = _loss(off_focus) + sum(map(_loss, off_side))
-    for ratio in GAMMA_RATIOS:
-        gamma_px, off_gamma = camera.gamma_px * ratio, math.log(ratio) / TOLD_GAMMA_ERROR
-        loss = lost + off_gamma**2 / 2
-        for deviation, sigma_px in seen:
-            if loss > most:
-                break
-            loss += _loss(deviation(thin_lens.blur_from_defocus(sigma_px, gamma_px)))
-        if loss <= most:
-            yield _Candidate(focus_m, ratio, loss)
 
 
 def _off_side(depth_m: float, focus_m: float, is_near: bool | None) -> float:

@@ -19,7 +19,7 @@ from sqlalchemy.orm import aliased
 from sqlmodel import Session, col, select
 from sqlmodel.sql.expression import SelectOfScalar
 
-from service.errors import Conflict, InsufficientStorage, NotFound
+from service.errors import Conflict, NotFound
 from service.optics.camera import Camera
 from service.principal import LOCAL
 from service.storage.cameras import store_calibrated
@@ -301,18 +301,11 @@ class Calibrations:
         )
         if self._owner is not None:
             ended = ended.where(col(CalibrationRow.owner) == self._owner)
-        forgotten, at_a_time = 0, FORGOTTEN_AT_A_TIME
+        forgotten = 0
         while True:
-            try:
-                count = self._forget(ended.limit(at_a_time))
-            except InsufficientStorage:
-                # until it is deleted SQLite keeps as much of it beside its file: one finds room where fifty do not
-                if at_a_time == 1:
-                    raise
-                at_a_time = 1
-                continue
+            count = self._forget(ended.limit(FORGOTTEN_AT_A_TIME))
             forgotten += count
-            if count < at_a_time:
+            if count < FORGOTTEN_AT_A_TIME:
                 return forgotten
             time.sleep(FORGETTING_PAUSE_S)
 

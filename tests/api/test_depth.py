@@ -164,6 +164,16 @@ def test_a_number_may_be_written_in_any_way(bench: TestClient, at: str, u: float
     assert ask(bench, known=f"{at}, 1.1000000000").status_code == 200
 
 
+def test_of_what_is_transparent_there_is_no_answer(bench: TestClient) -> None:
+    alpha = np.full((64, 96), 255, np.uint8)
+    alpha[:, :48] = 0
+    response = ask(bench, png(np.dstack([grey(), alpha])), format="npy")
+    assert "what is transparent, 50% of the photograph, shows nothing" in response.headers["camind-warnings"]
+    answered = np.isfinite(npy(response))
+    assert answered[:, 50:].all()
+    assert not answered[:, :46].any()
+
+
 def test_json_says_null_and_never_nan(bench: TestClient) -> None:
     response = ask(bench, png(grey(230)), format="json", at="3,3", side="auto")
     assert b"NaN" not in response.content

@@ -219,6 +219,24 @@ def test_a_black_border_is_not_answered_and_changes_no_answer(
     )
 
 
+def test_what_is_hidden_is_not_answered_and_changes_no_answer(estimator: Estimator) -> None:
+    picture, hidden = grey(60), np.zeros((64, 96), np.bool_)
+    plain = estimator.estimate(picture, CAMERA, "near")
+    hidden[20:44, 36:60] = True  # in the middle, where no border is
+    picture[hidden] = np.random.default_rng(0).integers(0, 255, (24 * 24, 3))
+    picture[:, :24] = 0
+    answer = estimator.estimate(picture, CAMERA, "near", hidden=hidden)
+    assert not answer.valid[20:44, 36:60].any()
+    assert not answer.valid[:, :22].any()
+    np.testing.assert_allclose(answer.depth_m[answer.valid], plain.depth_m[answer.valid], rtol=1e-3)
+    assert answer.valid[:, 64:].all()
+    assert answer.warnings == (
+        "what is transparent, 9% of the photograph, shows nothing: no answer there",
+        "a black border, 25% of the photograph, shows nothing: no answer there",
+        *plain.warnings,
+    )
+
+
 @pytest.mark.parametrize("side", ["auto", "near"])
 def test_relative_defocus_of_one_and_more_is_near(estimator: Estimator, side: Side) -> None:
     level = 200

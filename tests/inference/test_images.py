@@ -2,6 +2,8 @@
 
 import resource
 import struct
+import subprocess
+import sys
 import time
 import zlib
 from collections.abc import Callable
@@ -42,6 +44,29 @@ MAKERS: dict[str, Callable[..., bytes]] = {"jpeg": jpeg, "png": png, "tiff": tif
 UPRIGHT = {1: "rgbw", 2: "grwb", 3: "wbgr", 4: "bwrg", 5: "rbgw", 6: "brwg", 7: "wgbr", 8: "gwrb"}
 COLOURS = {"r": (255, 0, 0), "g": (0, 255, 0), "b": (0, 0, 255), "w": (255, 255, 255)}
 FOCAL, APERTURE = 0x920A, 0x829D
+
+IN_LITTLE_MEMORY = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from service.inference.artifact import load_model_folder
+from service.inference.cancellation import Cancellation
+from service.inference.images import read_photograph
+from service.inference.session import Graph
+from tests.inference.photographs import jpeg
+
+folder = load_model_folder(Path(sys.argv[1]))
+graph = Graph(folder.blur_graph, folder.manifest.graphs.blur, 1)
+data = jpeg(np.zeros((3000, 4000, 3), np.uint8))
+feeds = {name: np.zeros((1, 3, 2000, 2000), np.float32) for name in graph.input_names}
+size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (size + 2_000_000, resource.RLIM_INFINITY))
+for what, work in (("decoding", lambda: read_photograph(data)), ("running", lambda: graph.run(feeds, Cancellation()))):
+    try:
+        work()
+    except MemoryError:
+        print(what)
+"""
 
 
 @pytest.mark.parametrize("orientation", TURNS)
@@ -124,11 +149,69 @@ def test_ten_to_fourteen_bits_in_a_file_of_sixteen_are_no_dark_picture(kind: str
     assert read_photograph(encoded(kind, np.full_like(ramp, 255))).rgb.max() == 16  # a lens cap's
 
 
-def test_grey_becomes_rgb_and_alpha_is_dropped() -> None:
+def test_grey_becomes_rgb() -> None:
     grey = np.full((10, 12), 77, np.uint8)
     np.testing.assert_array_equal(read_photograph(encoded(".png", grey)).rgb[3, 3], (77, 77, 77))
-    clear = np.dstack([corners(), np.zeros((48, 64), np.uint8)])
-    np.testing.assert_array_equal(read_photograph(encoded(".png", clear)).rgb, corners())
+
+
+def half_transparent(kind: str, dtype: type[np.uint8 | np.uint16]) -> bytes:
+    """``corners()`` whose upper half is two thirds transparent."""
+    most = int(np.iinfo(dtype).max)
+    alpha = np.full((48, 64, 1), most, np.dtype(dtype))
+    alpha[:24] = most // 3
+    rgba = np.dstack([corners().astype(dtype) * (most // 255), alpha])
+    if kind == ".avif":
+        body = BytesIO()
+        Image.fromarray(rgba).save(body, "AVIF", quality=95, subsampling="4:4:4", speed=10)
+        return body.getvalue()
+    lossless = (cv2.IMWRITE_WEBP_QUALITY, 101) if kind == ".webp" else ()
+    data = encoded(kind, rgba, *lossless)
+    return tiff_with(data, {338: (3, 1, 2)}) if kind == ".tiff" else data
+
+
+@pytest.mark.parametrize(
+    ("kind", "dtype"),
+    [(".png", np.uint8), (".png", np.uint16), (".webp", np.uint8), (".tiff", np.uint16), (".avif", np.uint8)],
+)
+def test_what_is_transparent_is_hidden(kind: str, dtype: type[np.uint8 | np.uint16]) -> None:
+    photograph = read_photograph(half_transparent(kind, dtype))
+    assert photograph.hidden is not None
+    assert photograph.hidden[:24].all()
+    assert not photograph.hidden[24:].any()
+    assert np.abs(photograph.rgb.astype(int) - corners()).max() < (20 if kind == ".avif" else 1)
+
+
+def test_alpha_that_hides_nothing_or_all_of_it_says_nothing() -> None:
+    for rgba in (np.dstack([corners(), np.full((48, 64), alpha, np.uint8)]) for alpha in (0, 200, 255)):
+        photograph = read_photograph(encoded(".png", rgba))
+        assert photograph.hidden is None
+        np.testing.assert_array_equal(photograph.rgb, corners())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="others do not bound memory")
+def test_too_little_memory_is_no_damage_to_a_file_or_a_graph(tiny_model_dir: Path) -> None:
+    done = subprocess.run([sys.executable, "-c", IN_LITTLE_MEMORY, tiny_model_dir], check=False, capture_output=True)
+    assert done.stdout.split() == [b"decoding", b"running"], done.stderr
+
+
+def test_what_is_transparent_is_turned_along_and_not_overexposed() -> None:
+    rgba = np.dstack([np.full((48, 64, 3), 255, np.uint8), np.zeros((48, 64), np.uint8)])
+    rgba[:, :16] = (90, 90, 90, 255)
+    photograph = read_photograph(png(rgba, orientation=6))
+    assert photograph.hidden is not None
+    assert not photograph.hidden[:16].any()
+    assert photograph.hidden[16:].all()
+    assert photograph.warnings == ()
+
+
+@pytest.mark.parametrize(("transparency", "is_hidden"), [(3, True), (bytes([255]), False)])
+def test_a_palette_s_transparent_colours_are_hidden(transparency: int | bytes, *, is_hidden: bool) -> None:
+    out = BytesIO()
+    picture = Image.fromarray(corners()).quantize(4)
+    picture.save(out, "PNG", transparency=transparency)
+    hidden = read_photograph(out.getvalue()).hidden
+    assert (hidden is not None) == is_hidden
+    assert hidden is None or hidden.sum() == (np.asarray(picture) == 3).sum()
 
 
 @pytest.mark.parametrize("kept", [0.05, 0.5, 0.9, 0.99])

@@ -99,8 +99,8 @@ def test_of_one_thing_close_to_focus_the_side_asked_for_tells_where_focus_was() 
     maps = {name: np.full((128, 192), value, np.float32) for name, value in values.items()}
     read = Read(maps, TOLD, Part(0, 0, 384, 256), 2, (1.0,), 22.0)
     near, far = (Clues.of(read, TOLD, side, [KnownDepth(9, 9, 1.9)]).camera for side in SIDES)
-    assert near.focus_distance_m == pytest.approx(2.0, rel=0.01)
-    assert far.focus_distance_m < 1.95
+    assert near.focus_distance_m == pytest.approx(2.0, rel=0.04)
+    assert far.focus_distance_m < 1.91 < near.focus_distance_m - 0.02
 
 
 def test_a_side_that_is_known_is_that_of_what_is_like_it_and_near_by(estimator: Estimator) -> None:

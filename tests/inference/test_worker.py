@@ -7,6 +7,7 @@ import time
 import weakref
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 
 from service.errors import Busy
@@ -36,6 +37,10 @@ def obey(cancellation: Cancellation) -> None:
         time.sleep(0.005)
 
 
+def want_all_memory(_: Cancellation) -> None:
+    np.empty(2**60, np.uint8)
+
+
 async def until_idle(worker: Worker) -> None:
     for _ in range(400):
         if worker.in_flight == 0:
@@ -49,6 +54,14 @@ def test_work_returns_its_value_and_its_wait() -> None:
     outcome = asyncio.run(worker.run(None, add, 2, 3))
     assert outcome.value == 5
     assert 0 <= outcome.wait_ms < 1000
+    worker.close()
+
+
+def test_work_that_finds_too_little_memory_may_come_back() -> None:
+    worker = Worker(slots=1, queue_size=0, deadline_s=5)
+    with pytest.raises(Busy, match="too little memory"):
+        asyncio.run(worker.run(None, want_all_memory))
+    assert worker.in_flight == 0
     worker.close()
 
 

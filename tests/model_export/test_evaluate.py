@@ -30,7 +30,7 @@ from model_export.evaluation_sets import (
     viewed_cases,
 )
 from model_export.modes import ESTIMATED_K_CAM, MODES, RIGHT_SIDE, UNSEEN_K_CAM_PX
-from model_export.report import beside, write
+from model_export.report import beside, tables, write
 from model_export.summary import EQUAL_BLUR_PX, Pixels, Relief, Report, Sides, blur_ranges, summarise
 from service.inference.artifact import Interval, load_model_folder, write_manifest
 from service.inference.hypotheses import in_metres
@@ -178,13 +178,17 @@ def test_two_models_are_compared_on_the_same_pictures(tiny_model_dir: Path, tmp_
     shutil.copytree(tiny_model_dir, other)
     write_manifest(other, load_model_folder(other).manifest.model_copy(update={"blur_gain": 0.9}))
     pictures = [case(0.8)]
-    both = evaluate([tiny_model_dir, other], [EvaluationSet("grey", partial(iter, pictures))])
+    pictures[0].image[:, :10] = 0
+    both = evaluate([tiny_model_dir, other], [EvaluationSet("grey", partial(iter, pictures), ("gt", "k_cam +10%"))])
     own, others = (report.summary("grey").mean.abs_rel for report in both)
     assert own == pytest.approx(0.25, abs=1e-3)
     assert others > own + 0.02
     head, (row, worst) = beside(*both)
     assert row[:4] == ["grey", f"{own:.3f}", f"{others:.3f}", f"{others / own:.3f}"]
     assert worst[head.index("times")] == row[3]
+    warning = "a black border, 10% of the photograph, shows nothing: no answer there"
+    assert tables(both[0])["Warnings"][1] == [["grey", "1", "grey", warning]]
+    assert "Warnings" not in tables(replace(both[0], warnings={"rgbd k_cam 3.81": {warning: ["one"]}}))
 
 
 def test_plots_of_depth_show_a_users_own_sets(oracle: Examiner, tmp_path: Path) -> None:
