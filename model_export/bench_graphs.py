@@ -5,7 +5,7 @@ Everything compared is timed in turns, so that what slows the machine slows all 
 
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -225,27 +225,27 @@ def _session(graph: onnx.GraphProto, feeds: Mapping[str, NDArray[np.generic]], t
     return lambda: session.run(None, feeds)
 
 
-def _graph(nodes: Sequence[onnx.NodeProto], kind: int, **weights: NDArray[np.generic]) -> onnx.GraphProto:
+def _graph(node: onnx.NodeProto, kind: int, **weights: NDArray[np.generic]) -> onnx.GraphProto:
     given = helper.make_tensor_value_info("x", kind, None)
     made = helper.make_tensor_value_info("y", kind, None)
     held = [numpy_helper.from_array(values, name) for name, values in weights.items()]
-    return helper.make_graph(list(nodes), "rate", [given], [made], held)
+    return helper.make_graph([node], "rate", [given], [made], held)
 
 
 def _product_graph(weight: NDArray[np.float32]) -> onnx.GraphProto:
-    return _graph([helper.make_node("MatMul", ["x", "w"], ["y"])], TensorProto.FLOAT, w=weight)
+    return _graph(helper.make_node("MatMul", ["x", "w"], ["y"]), TensorProto.FLOAT, w=weight)
 
 
 def _convolution_graph(weight: NDArray[np.float32]) -> onnx.GraphProto:
     node = helper.make_node("Conv", ["x", "w"], ["y"], pads=[1, 1, 1, 1])
-    return _graph([node], TensorProto.FLOAT, w=weight)
+    return _graph(node, TensorProto.FLOAT, w=weight)
 
 
 def _integer_convolution_graph(weight: NDArray[np.float32]) -> onnx.GraphProto:
     names = ["x", "scale", "zero", "w", "w_scale", "w_zero", "scale", "zero"]
     node = helper.make_node("QLinearConv", names, ["y"], pads=[1, 1, 1, 1])
     return _graph(
-        [node],
+        node,
         TensorProto.UINT8,
         w=(weight * 100).astype(np.int8),
         scale=np.array(0.01, np.float32),

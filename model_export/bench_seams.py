@@ -14,7 +14,7 @@ from model_export.render import refocus
 from service.inference.artifact import load_model_folder
 from service.inference.estimator import Estimator
 from service.inference.pair import GraphPair
-from service.inference.tiles import Span, layout
+from service.inference.tiles import layout
 
 SIZE = (2000, 1500)
 BUDGETS = (1_700_000, 900_000)  # pixels of a tile: two tiles, and six
@@ -62,7 +62,7 @@ def compare(model: Path, on_round: Callable[[], None] = lambda: None) -> list[Se
     return rows
 
 
-def _row(whole_m: Map, tiled_m: Map, rows: list[Span], columns: list[Span]) -> SeamRow:
+def _row(whole_m: Map, tiled_m: Map, rows: list[slice], columns: list[slice]) -> SeamRow:
     off = np.abs(tiled_m / whole_m - 1)
     known = np.isfinite(off)
     places = np.concatenate([_places(rows), _places(columns)])
@@ -85,7 +85,7 @@ def _steps(log_m: Map) -> Map:
     return np.concatenate([np.nanmean(np.abs(np.diff(log_m, axis=axis)), axis=1 - axis) for axis in (0, 1)])
 
 
-def _places(along: list[Span]) -> NDArray[np.int64]:
+def _places(along: list[slice]) -> NDArray[np.int64]:
     """Of each step along one axis: across a border, in an overlap, or elsewhere."""
     places = np.full(along[-1].stop - 1, ELSEWHERE)
     for one, following in pairwise(along):

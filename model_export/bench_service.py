@@ -8,22 +8,20 @@ from dataclasses import dataclass
 from http import HTTPStatus
 from http.client import HTTPConnection
 
-import cv2
 import numpy as np
 
 from model_export.bench_graphs import FRAME_K_CAM_PX, NATIVE_K_CAM_PX, SIZE, Timing, draw_picture
 from model_export.started_server import Reply, Server, ask_over
+from service.inference.encode import encode_photograph
 
 CLIENTS = (1, 2, 4, 8, 16)
 FULL_SIZE = (4000, 3000)
 PHOTOGRAPHS_K_CAM_PX = (NATIVE_K_CAM_PX, 50.0)
 PERCENTILES = (50, 95, 99)
-JPEG_QUALITY = 90
 
 
 def _jpeg(width_px: int, height_px: int) -> bytes:
-    picture = cv2.cvtColor(draw_picture(width_px, height_px), cv2.COLOR_RGB2BGR)
-    return cv2.imencode(".jpg", picture, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))[1].tobytes()
+    return encode_photograph(draw_picture(width_px, height_px), max(width_px, height_px)).body
 
 
 @dataclass(frozen=True, slots=True)

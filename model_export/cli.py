@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
@@ -15,9 +15,9 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from model_export.config import MOST_SEED, Kind, Part
-from model_export.progress import progress_bar
 from service.config import INT8, SHIPPED_MODEL
 from service.inference.artifact import load_model_folder
+from service.terminal import print_table, progress_bar
 
 if TYPE_CHECKING:  # importing torch takes seconds; a command that needs it does so itself
     from model_export.summary import Report
@@ -57,21 +57,11 @@ Dataset = Literal["defocusnet", "ddff12", "nyu"]
 CheckpointPath = Annotated[Path, typer.Option(help="checkpoint file of a run, or a model folder", exists=True)]
 
 BLENDER_ENVIRONMENT = Path(".venv-blender")
-FILE_COLUMNS = 160
 
 
 def _fail(message: str) -> typer.Exit:
     typer.secho(message, err=True, fg="red")
     return typer.Exit(1)
-
-
-def _print(tables: Iterable[Table]) -> None:
-    """To the terminal at its width, to a file at one that holds them."""
-    stdout = Console()
-    if not stdout.is_terminal:
-        stdout.width = FILE_COLUMNS
-    for table in tables:
-        stdout.print(table)
 
 
 @contextmanager
@@ -241,7 +231,7 @@ def verify(checkpoint: CheckpointPath, model: Model = SHIPPED_MODEL) -> None:
 
     with _plain_failures():
         differences = verify_checkpoint(checkpoint, model)
-    Console().print(_differences(differences))
+    print_table(_differences(differences))
     worst = max(d.relative for d in differences)
     if not worst <= TOLERANCE:
         raise _fail(f"largest relative difference {worst:.1e} is above {TOLERANCE:.0e}")
@@ -298,7 +288,8 @@ def evaluate(
     tables = reports.tables(found[0])
     if beside is not None:
         tables |= {f"{found[1].model} beside {found[0].model}": reports.beside(*found)}
-    _print([_as_table(title, head, rows) for title, (head, rows) in tables.items()])
+    for title, (head, rows) in tables.items():
+        print_table(_as_table(title, head, rows))
     with _plain_failures():
         _keep(found, out, models if update_card else [], "camind evaluate --data DATA" + " --quick" * quick)
 
@@ -344,7 +335,8 @@ def speed(
     with progress_bar() as progress:
         task = progress.add_task("measuring", total=bench_speed.steps(rounds))
         report = bench_speed.measure(model, rounds, seconds, lambda: progress.advance(task))
-    _print(bench_speed.tables(report))
+    for table in bench_speed.tables(report):
+        print_table(table)
     if out is not None:
         out.write_text(json.dumps(asdict(report), indent=2) + "\n")
 
@@ -363,7 +355,6 @@ def calibration(
         from model_export import bench_calibration
         from model_export.devices import one_core
 
-    stdout = Console()
     with (
         progress_bar() as progress,
         ProcessPoolExecutor(workers, get_context("forkserver"), initializer=one_core) as pool,
@@ -372,7 +363,7 @@ def calibration(
             progress.track(pool.map(bench_calibration.random_camera, range(cameras)), cameras, description="cameras")
         )
         if found:
-            stdout.print(bench_calibration.error_table(found))
+            print_table(bench_calibration.error_table(found))
         if pairs:
             numbers = bench_calibration.PAPER_NUMBERS
             results = pool.map(bench_calibration.paper_pairs, numbers, [pairs] * len(numbers))
@@ -380,7 +371,7 @@ def calibration(
             for number, both in zip(numbers, progress.track(results, len(numbers), description="pairs"), strict=True):
                 for method, trial in both:
                     table.add_row(*bench_calibration.paper_row(number, method, trial))
-            stdout.print(table)
+            print_table(table)
 
 
 @commands.command()
@@ -396,23 +387,20 @@ def blender(
 
     edges, rooms = cycles.edges(), cycles.rooms(scenes)
     raw = out / "raw"
-    try:
-        with progress_bar() as progress:
-            task = progress.add_task("Blender", total=None)
-            python = blender_environment.environment(environment)
-            progress.update(task, description="rendering", total=len(edges) + len(rooms))
-            cycles.render(python, [*edges, *rooms], raw, lambda _: progress.advance(task))
-            progress.update(task, description="developing")
-            cycles.develop(raw, rooms, out)
-    except (OSError, ValueError, RuntimeError) as exc:
-        raise _fail(str(exc)) from exc
+    with _plain_failures(), progress_bar() as progress:
+        task = progress.add_task("Blender", total=None)
+        python = blender_environment.environment(environment)
+        progress.update(task, description="rendering", total=len(edges) + len(rooms))
+        cycles.render(python, [*edges, *rooms], raw, lambda _: progress.advance(task))
+        progress.update(task, description="developing")
+        cycles.develop(raw, rooms, out)
     table = Table("edge", "sigma px", "Cycles", "ours", "ours / Cycles")
     worst = 0.0
     for result in cycles.compare_edges(raw, edges):
         ratio = result.ours_px / result.cycles_px
         worst = max(worst, abs(ratio - 1))
         table.add_row(result.name, *(f"{v:.3f}" for v in (result.expected_px, result.cycles_px, result.ours_px, ratio)))
-    Console().print(table)
+    print_table(table)
     if worst > cycles.EDGE_TOLERANCE:
         raise _fail(f"ours and Cycles differ by {worst:.1%}, more than {cycles.EDGE_TOLERANCE:.0%}")
 
@@ -432,16 +420,13 @@ def homes(
         from model_export.datasets import blender_environment
         from model_export.datasets import homes as furnished
 
-    try:
-        with progress_bar() as progress:
-            task = progress.add_task("Blender", total=None)
-            python = blender_environment.environment(environment)
-            models = furnished.unpack(furniture, out / "models")
-            due = furnished.due(out, rooms)
-            progress.update(task, description="rendering", total=len(due) * furnished.VIEWS)
-            furnished.render(python, models, textures, due, out, lambda _: progress.advance(task))
-    except (OSError, ValueError, RuntimeError) as exc:
-        raise _fail(str(exc)) from exc
+    with _plain_failures(), progress_bar() as progress:
+        task = progress.add_task("Blender", total=None)
+        python = blender_environment.environment(environment)
+        models = furnished.unpack(furniture, out / "models")
+        due = furnished.due(out, rooms)
+        progress.update(task, description="rendering", total=len(due) * furnished.VIEWS)
+        furnished.render(python, models, textures, due, out, lambda _: progress.advance(task))
     typer.echo(out)
 
 

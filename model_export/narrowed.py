@@ -24,9 +24,9 @@ from model_export.devices import torch_threads
 from model_export.losses import Batch, run_pair
 from model_export.networks import Normed, Pair, Widths, make_pair
 from model_export.pool import Pool, held_out
-from model_export.progress import progress_bar
 from model_export.scenes import Material
 from model_export.textures import load_photographs
+from service.terminal import progress_bar
 
 PIXELS = 10_000  # of a batch, of each map
 RIDGE = 1e-7

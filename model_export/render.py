@@ -223,13 +223,11 @@ def composite(layers: Iterable[tuple[Tensor, Tensor]]) -> Tensor:
     The last layer must be opaque; what little it lacks is divided out, so a constant stays constant. Alpha is
     not clamped: a band-limited disc rings by a percent, colour and alpha alike, and cutting one alone would show.
     """
-    image: Tensor | None = None
-    clear: Tensor | None = None
-    for color, alpha in layers:
-        image = color if image is None or clear is None else image + clear * color
-        clear = 1 - alpha if clear is None else clear * (1 - alpha)
-    if image is None or clear is None:
-        raise ValueError("nothing to render: no layers")
+    (image, alpha), *others = layers
+    clear = 1 - alpha
+    for color, alpha in others:
+        image = image + clear * color
+        clear = clear * (1 - alpha)
     return image / (1 - clear).clamp_min(1e-3)
 
 

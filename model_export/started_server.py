@@ -59,7 +59,7 @@ class Server:
             # away from the checkout, whose packages would hide those of another installation
             self.process = subprocess.Popen(command, env=environment, stderr=log, cwd=data_dir.parent)
         self.port = self._wait_for_port()
-        self._wait_until_ready()
+        self.poll(lambda: self.ask("GET", "/health/ready").status == 200)
 
     @property
     def url(self) -> str:
@@ -109,9 +109,6 @@ class Server:
             return int(found[1]) if found else None
 
         return self.poll(find)
-
-    def _wait_until_ready(self) -> None:
-        self.poll(lambda: self.ask("GET", "/health/ready").status == 200)
 
     def poll(self, look: Callable[[], T | None]) -> T:
         give_up = time.monotonic() + START_S

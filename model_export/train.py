@@ -25,10 +25,10 @@ from model_export.losses import Batch, run_pair, total_loss
 from model_export.networks import SHIPPED_WIDTHS, CompactDepth, Pair, Widths, make_pair, with_fresh_decoders
 from model_export.optimizers import Optimizers
 from model_export.pool import STOPS, Pools, held_out
-from model_export.progress import progress_bar
 from model_export.scenes import Material
 from model_export.textures import load_photographs
 from service.cores import available_cores
+from service.terminal import progress_bar
 
 CHECKPOINT, LOG = "checkpoint.pt", "log.txt"
 MOST_HELD_OUT = 32

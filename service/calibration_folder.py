@@ -11,9 +11,9 @@ from service.calibration.calibrate import Picture, Shot, Task, calibrate
 from service.calibration.fit import Interval
 from service.calibration.report import PictureReport, Report, Role
 from service.errors import InvalidImage
-from service.file_names import name_column, print_table, shown
 from service.inference.images import SUFFIXES, ImageLimits, photographs_in, read_stored_frame
 from service.metres import in_words
+from service.terminal import name_column, print_table, shown
 
 REPORT = TypeAdapter(Report)
 

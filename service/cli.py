@@ -15,14 +15,7 @@ import typer
 from sqlalchemy import Engine
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.config import (
-    DATABASE_FILE,
-    Settings,
-    SettingsError,
-    StorageSettings,
-    load_settings,
-    load_storage_settings,
-)
+from service.config import DATABASE_FILE, Settings, SettingsError, StorageSettings, load_settings, load_storage_settings
 from service.errors import BadRequest, CamindError, Conflict, NotFound
 from service.memory import end_uncollected, lasting
 from service.optics.camera import FOCUS_DISTANCES_M
@@ -86,6 +79,7 @@ def serve(
         from service import logs, server
         from service.app import create_app
         from service.inference.artifact import load_model_folder
+        from service.storage.cameras import has_had_cameras
         from service.storage.spool import Spool
 
     logs.configure(settings.log_level, settings.log_format)
@@ -95,8 +89,8 @@ def serve(
         served = create_app(settings)
         _require_sound(settings)
         with _opened(settings) as engine:
-            if seed and settings.is_database_embedded:
-                _seed_new(engine)
+            if seed and settings.is_database_embedded and not has_had_cameras(engine):
+                _seed(engine, LOCAL)
             if settings.wants_keys:
                 _require_key(settings, engine)
         Spool(settings.spool_dir)
@@ -129,10 +123,12 @@ def back_up(
 
     Photographs that wait to be calibrated are not in it.
     """
-    from service.storage.backup import backup
+    from service.storage.backup import backup, database_file
 
     _end_in_order()
-    database = _database_file(_storage())
+    database = database_file(_storage().effective_database_url)
+    if database is None:
+        raise _failure("Only an SQLite file is backed up here: use pg_dump and pg_restore for PostgreSQL.", WRONG_USE)
     with _plain_failures():
         contents = backup(database, file, is_forced=force)
     typer.echo(f"{file} holds {contents}")
@@ -266,7 +262,7 @@ def calibrate(
 def _store_calibrated(name: str, result: "Result", owner: str) -> None:
     from service.storage.cameras import Cameras
 
-    with _plain_failures(), _ready_engine() as engine:
+    with _ready_engine() as engine:
         record = Cameras(engine, owner).store_calibrated(name, result.to_camera())
     typer.echo(f"stored as {record.name}, revision {record.revision}")
 
@@ -326,7 +322,7 @@ def print_version() -> None:
 @cameras_app.command(name="seed")
 def seed_cameras(owner: Owner = LOCAL) -> None:
     """Store the cameras of the paper's Table 1; names already there are left as they are."""
-    with _plain_failures(), _ready_engine() as engine:
+    with _ready_engine() as engine:
         names = _seed(engine, owner)
     typer.echo("\n".join(names) if names else "Every seed is there already.")
 
@@ -336,14 +332,6 @@ def _seed(engine: Engine, owner: str) -> list[str]:
     from service.storage.seeds import seed
 
     return seed(Cameras(engine, owner))
-
-
-def _seed_new(engine: Engine) -> None:
-    """Seed a database that is new, as it is too where an earlier start or command made it and came no further."""
-    from service.storage.cameras import has_had_cameras
-
-    if not has_had_cameras(engine):
-        _seed(engine, LOCAL)
 
 
 @cameras_app.command(name="add")
@@ -381,21 +369,17 @@ def add_camera(
 
 
 def _stored(cameras: "Cameras", draft: "CameraDraft", *, replace: bool) -> "CameraRecord":
+    """The camera, new, or at a new revision, or as it is where that would be the same."""
     try:
         return cameras.add(draft)
     except Conflict as exc:
         if not replace:
             raise _failure(f"A camera '{draft.name}' exists already: --replace gives it a new revision.") from exc
-        return _replaced(cameras, draft)
-
-
-def _replaced(cameras: "Cameras", draft: "CameraDraft") -> "CameraRecord":
-    """The camera at a new revision, or as it is where that would be the same."""
     record = cameras.get(draft.name)
-    if record.draft == draft:
-        typer.echo("unchanged:", err=True)
-        return record
-    return cameras.replace(draft)
+    if record.draft != draft:
+        return cameras.replace(draft)
+    typer.echo("unchanged:", err=True)
+    return record
 
 
 @cameras_app.command(name="show")
@@ -403,7 +387,7 @@ def show_camera(name: CameraName, owner: Owner = LOCAL) -> None:
     """Print a camera as the JSON that add takes."""
     from service.api.schemas import CameraCreate
 
-    with _plain_failures(), _ready_engine() as engine:
+    with _ready_engine() as engine:
         record = _camera(engine, owner, name)
     typer.echo(CameraCreate.from_record(record).model_dump_json(indent=2, exclude_none=True))
 
@@ -413,7 +397,7 @@ def delete_camera(name: CameraName, owner: Owner = LOCAL) -> None:
     """Free a camera's name; what was stored of it stays in the database."""
     from service.storage.cameras import Cameras
 
-    with _plain_failures(), _ready_engine() as engine:
+    with _ready_engine() as engine:
         record = _camera(engine, owner, name)
         Cameras(engine, owner).delete(name)
     typer.echo(_line_of(record))
@@ -441,7 +425,7 @@ def list_cameras(owner: Owner = LOCAL) -> None:
     """Print name, revision, k_cam, focus distance and image size, a camera a line."""
     from service.storage.cameras import Cameras, camera_counts
 
-    with _plain_failures(), _ready_engine() as engine:
+    with _ready_engine() as engine:
         cameras, after, has_more = Cameras(engine, owner), None, True
         while has_more:
             records, has_more = cameras.page(100, after)
@@ -465,7 +449,7 @@ def prune_calibrations(
     """Delete, of every owner, what ended longer ago than that. The cameras that came of it stay."""
     from service.storage.calibrations import Calibrations
 
-    with _plain_failures(), _ready_engine() as engine:
+    with _ready_engine() as engine:
         count = Calibrations(engine).forget(datetime.now(UTC) - timedelta(days=days))
     typer.echo(f"deleted calibrations: {count}")
 
@@ -491,7 +475,7 @@ def create_key(
     if unknown:
         raise _failure(f"There is no scope {', '.join(unknown)}: take {', '.join(SCOPES)}.", WRONG_USE)
     expires_at = None if days is None else datetime.now(UTC) + timedelta(days=days)
-    with _plain_failures(), _ready_engine() as engine:
+    with _ready_engine() as engine:
         key, text = Keys(engine).create(name, owner or name, scopes, expires_at)
     until = f"until {key.expires_at:%Y-%m-%d %H:%M} UTC" if key.expires_at else "until it is revoked"
     typer.echo(f"Key {key.id} for {key.owner}: {', '.join(scopes)}; good {until}. It is shown this once:", err=True)
@@ -514,7 +498,7 @@ def list_keys() -> None:
         dates = f"expires {moment(key.expires_at)}\tused {moment(key.last_used_at)}"
         return f"{key.id}\t{key.name}\t{key.owner}\t{scopes}\t{state}\t{dates}"
 
-    with _plain_failures(), _ready_engine() as engine:
+    with _ready_engine() as engine:
         for key in Keys(engine).every():
             typer.echo(line(key))
 
@@ -524,7 +508,7 @@ def revoke_key(key_id: Annotated[str, typer.Argument(help="As `camind keys list`
     """Refuse a key from now on; what it made stays with its owner."""
     from service.storage.keys import Keys
 
-    with _plain_failures(), _ready_engine() as engine:
+    with _ready_engine() as engine:
         key = Keys(engine).revoke(key_id)
     typer.echo(f"Key {key.id} ({key.name}) is refused from now on.")
 
@@ -548,22 +532,14 @@ def _drop_unwritten() -> None:
 
 
 def _settings(**overrides: object) -> Settings:
-    with _settings_said():
+    with _plain_failures(WRONG_USE):
         return load_settings(**overrides)
 
 
 def _storage() -> StorageSettings:
     """Where the data are: how they are served is no matter of a command on them."""
-    with _settings_said():
+    with _plain_failures(WRONG_USE):
         return load_storage_settings()
-
-
-@contextmanager
-def _settings_said() -> Iterator[None]:
-    try:
-        yield
-    except SettingsError as exc:
-        raise _failure(str(exc), WRONG_USE) from exc
 
 
 def _require_key(settings: Settings, engine: Engine) -> None:
@@ -602,10 +578,10 @@ def _opened(settings: StorageSettings, *, is_migrated: bool = False) -> Iterator
 
 @contextmanager
 def _ready_engine() -> Iterator[Engine]:
-    """The configured database, at the newest schema."""
+    """The configured database, at the newest schema; what fails with it is a message."""
     from service.storage import schema
 
-    with _opened(_storage()) as engine:
+    with _plain_failures(), _opened(_storage()) as engine:
         schema.require_head(engine)
         yield engine
 
@@ -632,18 +608,8 @@ def _require_sound(settings: StorageSettings) -> None:
             require_sound(database)
 
 
-def _database_file(settings: StorageSettings) -> Path:
-    """The file of the configured database; PostgreSQL has commands of its own for it."""
-    from service.storage.backup import database_file
-
-    database = database_file(settings.effective_database_url)
-    if database is None:
-        raise _failure("Only an SQLite file is backed up here: use pg_dump and pg_restore for PostgreSQL.", WRONG_USE)
-    return database
-
-
 @contextmanager
-def _plain_failures() -> Iterator[None]:
+def _plain_failures(code: int = 1) -> Iterator[None]:
     """What an operator can mend is a message, not a traceback."""
     from service.inference.artifact import ModelFolderError
 
@@ -652,14 +618,14 @@ def _plain_failures() -> Iterator[None]:
     except SQLAlchemyError as exc:
         if isinstance(exc.__context__, SystemExit):
             raise exc.__context__ from None  # a signal came amid a statement, which is not the database's fault
-        raise _failure(f"The database cannot be used: {_reason(exc)}") from exc
+        raise _failure(f"The database cannot be used: {_reason(exc)}", code) from exc
     except BrokenPipeError:
         raise  # whoever read what is printed has enough
     except UnicodeEncodeError as exc:
         raise _failure(f"{ascii(exc.object)[:80]} is no text: its bytes are no UTF-8.", WRONG_USE) from exc
     except (CamindError, ModelFolderError, SettingsError, OSError) as exc:
         cause = exc.__cause__ if isinstance(exc, CamindError) and exc.status >= 500 else None
-        raise _failure(f"{exc}\n{_reason(cause)}" if cause else str(exc)) from exc
+        raise _failure(f"{exc}\n{_reason(cause)}" if cause else str(exc), code) from exc
 
 
 def _reason(cause: BaseException) -> str:

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from pydantic import ValidationError
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from service.api.depth_schemas import DepthQuery, DepthRead
@@ -16,7 +15,6 @@ from service.api.problems import invalid_model
 from service.api.uploads import Upload
 from service.config import Settings
 from service.errors import CamindError
-from service.file_names import name_column, print_table, shown
 from service.inference.artifact import load_model_folder
 from service.inference.cancellation import Cancellation
 from service.inference.estimator import Estimator
@@ -24,6 +22,7 @@ from service.inference.images import SUFFIXES, ImageLimits, photographs_in
 from service.memory import keep_freed_memory
 from service.metres import in_words
 from service.storage.cameras import CameraRecord
+from service.terminal import name_column, print_table, progress_bar, shown
 
 ENDINGS = {"preview": ".jpg"}  # of the others it is their name
 
@@ -115,9 +114,8 @@ def _all_made(photographs: Sequence[Path], errand: Errand, estimator: Estimator,
     """What came of each, under a progress bar and then in a table; one that cannot be read keeps no other from it."""
     made: dict[Path, Made] = {}
     cancellation = Cancellation()
-    columns = (TextColumn("depth"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     try:
-        with Progress(*columns, console=Console(stderr=True)) as progress, ThreadPoolExecutor(slots) as pool:
+        with progress_bar() as progress, ThreadPoolExecutor(slots) as pool:
             bar = progress.add_task("depth", total=len(photographs))
             running = {pool.submit(_made, path, errand, estimator, cancellation): path for path in photographs}
             try:

@@ -9,14 +9,15 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import structlog
 from pydantic import ConfigDict, JsonValue, TypeAdapter
 from pydantic.dataclasses import dataclass
 
-from service.calibration.calibrate import Picture, Shot, Task
+from service.calibration.calibrate import Picture, Shot, Task, Tell
 from service.calibration.report import Method, PictureReport, Report, Result, Role
 from service.calibration.target import CircleGrid
 from service.errors import CamindError
@@ -34,20 +35,10 @@ RETRY_S = 1.0
 GIVE_UP_S = 3600.0  # between looks for what other processes left behind
 CLOSE_S = 10.0
 
+# ``service.calibration.calibrate.calibrate``, or what stands in for it
+Calibrate = Callable[[Task, Sequence[Picture], Tell, Callable[[], None]], Report]
+
 log = structlog.stdlib.get_logger("camind.calibration")
-
-
-class Calibrate(Protocol):
-    """``service.calibration.calibrate.calibrate``, or what stands in for it."""
-
-    def __call__(
-        self,
-        task: Task,
-        pictures: Sequence[Picture],
-        *,
-        tell: Callable[[float, tuple[PictureReport, ...]], None],
-        check: Callable[[], None],
-    ) -> Report: ...
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -168,20 +159,13 @@ class Runner:
             return Ending("failed", problem=f"The service stopped {MOST_ATTEMPTS} times while it worked on this.")
         settings = SETTINGS.validate_python(record.draft.settings)
         pictures = [
-            Picture(stored.name, ROLE.validate_python(stored.role), self._loader(path))
+            Picture(stored.name, ROLE.validate_python(stored.role), partial(_shot, path, self._limits))
             for stored, path in zip(record.draft.pictures, paths, strict=True)
         ]
         progress = _Progress(self._calibrations, record, self._stop)
         task = Task(settings.pattern, settings.focus_distance_m, settings.method)
-        report = self._calibrate(task, pictures, tell=progress.tell, check=progress.check)
+        report = self._calibrate(task, pictures, progress.tell, progress.check)
         return _ending(report, is_registered=settings.register)
-
-    def _loader(self, path: Path) -> Callable[[], Shot]:
-        def load() -> Shot:
-            frame = read_stored_frame(path.read_bytes(), self._limits)
-            return Shot(frame.rgb, frame.exif.f_number)
-
-        return load
 
     def _insist(self, write: Callable[[], object]) -> None:
         """Write until the database takes it or the service stops."""
@@ -227,6 +211,11 @@ class _Progress:
                 self._is_wanted = self._calibrations.is_running(self._id)
         if self._stop.is_set() or not self._is_wanted:
             raise Cancelled
+
+
+def _shot(path: Path, limits: ImageLimits) -> Shot:
+    frame = read_stored_frame(path.read_bytes(), limits)
+    return Shot(frame.rgb, frame.exif.f_number)
 
 
 def _ending(report: Report, *, is_registered: bool) -> Ending:

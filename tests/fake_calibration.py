@@ -89,7 +89,6 @@ class FakeCalibration:
         self,
         task: Task,
         pictures: Sequence[Picture],
-        *,
         tell: Callable[[float, tuple[PictureReport, ...]], None],
         check: Callable[[], None],
     ) -> Report:

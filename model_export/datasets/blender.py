@@ -81,7 +81,7 @@ def rooms(count: int, size_px: int = 256) -> list[Scene]:
 def render(python: Path, scenes: list[Scene], out: Path, on_progress: Callable[[str], None] = lambda _: None) -> None:
     """Render to ``out``/NAME.npz (``light`` linear [h,w,3], ``depth_m`` [h,w]); what is there is kept.
 
-    Raises ``RuntimeError`` with the worker's last words if it fails.
+    Raises ``ChildProcessError`` with the worker's last words if it fails.
     """
     run_workers(python, WORKER, shares([asdict(scene) for scene in scenes]), out, on_progress)
 

@@ -26,7 +26,7 @@ Item = TypeVar("Item")
 def environment(folder: Path) -> Path:
     """The Python of an environment that has Blender; made in ``folder`` if it is not there yet (370 MB).
 
-    Raises ``FileNotFoundError`` without the Python that Blender is built for, ``RuntimeError`` if it cannot be
+    Raises ``FileNotFoundError`` without the Python that Blender is built for, ``ChildProcessError`` if it cannot be
     installed.
     """
     python, complete = folder / "bin" / "python", folder / COMPLETE
@@ -38,7 +38,7 @@ def environment(folder: Path) -> Path:
     for command in ([base, "-m", "venv", str(folder)], [str(python), "-m", "pip", "install", "--quiet", BPY]):
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
-            raise RuntimeError(f"{' '.join(command)} failed: {done.stderr.strip()[-500:]}")
+            raise ChildProcessError(f"{' '.join(command)} failed: {done.stderr.strip()[-500:]}")
     complete.touch()
     return python
 
@@ -70,7 +70,7 @@ def run_workers(
 def run_worker(python: Path, worker: Path, spec: object, out: Path, on_progress: Callable[[str], None]) -> None:
     """Have Blender's Python run a script on a specification in JSON and a folder; each file's name as it is done.
 
-    Raises ``RuntimeError`` with the script's last words if it fails.
+    Raises ``ChildProcessError`` with the script's last words if it fails.
     """
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as scratch:
@@ -84,4 +84,4 @@ def run_worker(python: Path, worker: Path, spec: object, out: Path, on_progress:
                 if line.startswith("rendered "):
                     on_progress(line.split()[1])
         if running.returncode:
-            raise RuntimeError(f"Blender failed: {''.join(said)}")
+            raise ChildProcessError(f"Blender failed: {''.join(said)}")

@@ -122,7 +122,7 @@ def render(
 ) -> None:
     """Render furnished rooms as frames: ``color/``, ``depth/`` and ``cameras.json``, and ``LICENCES.md``.
 
-    Raises ``RuntimeError`` with the worker's last words if it fails.
+    Raises ``ChildProcessError`` with the worker's last words if it fails.
     """
     for part in ("color", "depth"):
         (out / part).mkdir(parents=True, exist_ok=True)

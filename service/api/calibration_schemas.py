@@ -2,9 +2,9 @@
 
 from dataclasses import asdict
 from datetime import datetime
-from typing import Annotated, Literal, Self
+from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
 
 from service.api.cursors import NextCursor
 from service.api.problems import invalid_request
@@ -14,14 +14,20 @@ from service.calibration.look import Exposure, Look
 from service.calibration.report import Method, Role
 from service.calibration.target import CircleGrid, Kind
 from service.errors import BadRequest
-from service.storage.calibrations import CalibrationRecord, State
+from service.inference.frame import FocalLengthFrom
+from service.storage.calibrations import State
 
 SETTINGS_FIELD = "settings"
-FocalLengthFrom = Literal["camera", "exif"]
 
 Circles = Annotated[int, Field(ge=2, le=40)]
 Millimetres = Annotated[float, Field(gt=0, le=1_000, allow_inf_nan=False)]
 Utc = Annotated[datetime, Field(description="UTC")]
+EXAMPLE: dict[str, JsonValue] = {
+    "pattern": {"kind": "asymmetric_circles", "rows": 11, "columns": 4, "spacing_mm": 20.0, "diameter_mm": 12.0},
+    "focus_distance_m": None,
+    "method": "edge",
+    "register": True,
+}
 
 
 class Pattern(Given):
@@ -37,25 +43,7 @@ class Pattern(Given):
 class CalibrationSettings(Given):
     """What to look for in the photographs, and what to do with what is found."""
 
-    model_config = ConfigDict(
-        serialize_by_alias=True,
-        json_schema_extra={
-            "examples": [
-                {
-                    "pattern": {
-                        "kind": "asymmetric_circles",
-                        "rows": 11,
-                        "columns": 4,
-                        "spacing_mm": 20.0,
-                        "diameter_mm": 12.0,
-                    },
-                    "focus_distance_m": None,
-                    "method": "edge",
-                    "register": True,
-                }
-            ]
-        },
-    )
+    model_config = ConfigDict(serialize_by_alias=True, json_schema_extra={"examples": [EXAMPLE]})
 
     pattern: Pattern
     focus_distance_m: Annotated[
@@ -204,6 +192,8 @@ class LookRead(BaseModel):
 class CalibrationItem(BaseModel):
     """A calibration in a list."""
 
+    model_config = ConfigDict(from_attributes=True, serialize_by_alias=True)
+
     id: str
     camera: Name
     state: Annotated[State, Field(description="The last three are final")]
@@ -226,16 +216,9 @@ class CalibrationPage(BaseModel):
 class CalibrationRead(CalibrationItem):
     """A calibration: how far it is, what each photograph gave so far, and the result once it has succeeded."""
 
-    model_config = ConfigDict(serialize_by_alias=True)
-
     settings: CalibrationSettings
     images: Annotated[list[ImageRead], Field(description="The photographs looked at so far")]
     result: ResultRead | None
-
-    @classmethod
-    def from_record(cls, record: CalibrationRecord) -> Self:
-        """The stored calibration."""
-        return cls.model_validate(record, from_attributes=True)
 
 
 def _in_field(fault: dict[str, object]) -> dict[str, object]:

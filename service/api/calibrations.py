@@ -147,7 +147,7 @@ async def create_calibration(
             record = await _waited(request.app, calibrations, record, wait_s)
             response.headers["Preference-Applied"] = f"wait={wait_s}"
             response.status_code = 200 if record.has_ended else 202
-    return CalibrationRead.from_record(record)
+    return CalibrationRead.model_validate(record)
 
 
 @router.get(
@@ -164,7 +164,7 @@ def list_calibrations(
     """Calibrations a page at a time, without images and results."""
     summaries, has_more = calibrations.page(limit, name_of(cursor, ID_PATTERN))
     return CalibrationPage(
-        items=[CalibrationItem.model_validate(summary, from_attributes=True) for summary in summaries],
+        items=[CalibrationItem.model_validate(summary) for summary in summaries],
         next_cursor=cursor_after(summaries[-1].id) if has_more else None,
     )
 
@@ -177,7 +177,7 @@ def list_calibrations(
 )
 def read_calibration(record: FoundDep) -> CalibrationRead:
     """How far it is, what each photograph gave, and the result or the problem at its end."""
-    return CalibrationRead.from_record(record)
+    return CalibrationRead.model_validate(record)
 
 
 @router.get(
@@ -201,7 +201,7 @@ async def follow_calibration(
         with suppress(Busy, NotReady):
             if key_id is not None and not await run_in_threadpool(keys.is_good, key_id):
                 return
-        yield ServerSentEvent(data=CalibrationRead.from_record(now), id=str(now.version))
+        yield ServerSentEvent(data=CalibrationRead.model_validate(now), id=str(now.version))
 
 
 @router.get(
@@ -232,7 +232,7 @@ def accept_calibration(record: FoundDep, calibrations: CalibrationsDep, body: Ac
     if record.result is None:
         raise Conflict(f"This calibration is {record.state} and has no result: only one that succeeded is accepted.")
     camera = RESULT.validate_python(record.result).to_camera()
-    return CalibrationRead.from_record(calibrations.accept(record.id, body.camera or record.camera, camera))
+    return CalibrationRead.model_validate(calibrations.accept(record.id, body.camera or record.camera, camera))
 
 
 @router.delete(

@@ -124,7 +124,7 @@ async def draft_camera_from_photo(request: Request) -> CameraDraftRead:
 def preview_camera(body: CameraReplace) -> PreviewRead:
     """k_cam, range and blur curve of a camera as `POST /cameras` takes it, name or not; nothing is stored."""
     draft = body.to_draft("preview")
-    middle_m = _middle_m(draft.camera)
+    middle_m = draft.camera.middle_m
     points = _curve(draft.camera, middle_m / CURVE_SPAN, middle_m * CURVE_SPAN, CURVE_POINTS)
     return PreviewRead.from_draft(draft, points)
 
@@ -221,7 +221,7 @@ def read_curve(
     Of one focused at 50 m or farther, which is all but infinity, from a fifth to five times where its range ends.
     """
     record = cameras.get(name)
-    middle_m = _middle_m(record.camera)
+    middle_m = record.camera.middle_m
     near = near_m if near_m is not None else min(middle_m, far_m or middle_m) / CURVE_SPAN
     far = far_m if far_m is not None else max(middle_m, near_m or middle_m) * CURVE_SPAN
     if near >= far:
@@ -258,22 +258,15 @@ def _is_at_hand(revision: int, if_none_match: str | None) -> bool:
     return "*" in tags or f'"{revision}"' in tags
 
 
-def _middle_m(camera: Camera) -> float:
-    """What a curve is drawn around where nothing else is asked for."""
-    focus_m, range_ends_m = camera.focus_distance_m, camera.range_m[1]
-    return min(focus_m, range_ends_m) if focus_m >= AS_INFINITY_M else focus_m
-
-
 def _curve(camera: Camera, near_m: float, far_m: float, points: int) -> list[CurvePoint]:
-    depths = [near_m + (far_m - near_m) * step / (points - 1) for step in range(points)]
-    return [_curve_point(camera, depth_m) for depth_m in depths]
-
-
-def _curve_point(camera: Camera, depth_m: float) -> CurvePoint:
     focus_m, k_cam_px = camera.focus_distance_m, camera.k_cam_px
-    return CurvePoint(
-        depth_m=depth_m,
-        blur_px=camera.blur_px(depth_m),
-        defocus_px=thin_lens.defocus_at_depth(depth_m, focus_m, k_cam_px),
-        depth_error_m=thin_lens.depth_error(depth_m, focus_m, k_cam_px, RANGE_BLUR_ERROR_PX),
-    )
+    depths = (near_m + (far_m - near_m) * step / (points - 1) for step in range(points))
+    return [
+        CurvePoint(
+            depth_m=depth_m,
+            blur_px=camera.blur_px(depth_m),
+            defocus_px=thin_lens.defocus_at_depth(depth_m, focus_m, k_cam_px),
+            depth_error_m=thin_lens.depth_error(depth_m, focus_m, k_cam_px, RANGE_BLUR_ERROR_PX),
+        )
+        for depth_m in depths
+    ]

@@ -1,12 +1,11 @@
 """``POST /calibrate/look``: one photograph of the sheet, and what a calibration would make of it."""
 
-from dataclasses import dataclass
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request
 from fastapi.concurrency import run_in_threadpool
 
-from service.api.calibration_schemas import FocalLengthFrom, LookRead
+from service.api.calibration_schemas import LookRead
 from service.api.clients import unless_gone
 from service.api.dependencies import CamerasDep, SettingsDep, SharerDep, WorkerDep
 from service.api.problems import responses
@@ -17,22 +16,11 @@ from service.calibration.look import look
 from service.calibration.target import CircleGrid
 from service.errors import BadRequest, Busy, InvalidImage, NotFound, TooLarge, UnsupportedKind
 from service.inference.cancellation import Cancellation
-from service.inference.drafting import draft_camera
-from service.inference.frame import stored_camera_of
-from service.inference.images import ImageLimits, StoredFrame, read_stored_frame
-from service.optics.camera import Camera, Intrinsics, Lens
+from service.inference.frame import stored_intrinsics
+from service.inference.images import ImageLimits, read_stored_frame
+from service.optics.camera import Camera
 
 router = APIRouter(prefix="/calibrate", tags=["calibration"])
-
-
-@dataclass(frozen=True, slots=True)
-class Order:
-    """Everything the work needs, so that it touches neither request nor database."""
-
-    data: bytes
-    grid: CircleGrid
-    camera: Camera | None
-    limits: ImageLimits
 
 
 @router.post(
@@ -57,27 +45,16 @@ async def look_at_photograph(
     """
     known = (await run_in_threadpool(cameras.get, camera)).draft.with_focal_length if camera else None
     upload = await receive_photograph(request)
-    order = Order(upload.data, grid, known, ImageLimits.of(settings))
-    return (await unless_gone(request, worker.run(sharer, fulfil, order))).value
+    work = worker.run(sharer, _seen, upload.data, grid, known, ImageLimits.of(settings))
+    return (await unless_gone(request, work)).value
 
 
-def fulfil(cancellation: Cancellation, order: Order) -> LookRead:
+def _seen(
+    cancellation: Cancellation, data: bytes, grid: CircleGrid, camera: Camera | None, limits: ImageLimits
+) -> LookRead:
     """Decode and look: all the work of a request, in one thread."""
-    frame = read_stored_frame(order.data, order.limits)
+    frame = read_stored_frame(data, limits)
     cancellation.check()
-    intrinsics, source = _intrinsics(order.camera, frame)
-    seen = look(frame.rgb, order.grid, intrinsics, cancellation.check)
+    intrinsics, source = stored_intrinsics(frame, camera)
+    seen = look(frame.rgb, grid, intrinsics, cancellation.check)
     return LookRead.from_look(seen, frame.orientation, source if seen.distance_m else None)
-
-
-def _intrinsics(of: Camera | None, frame: StoredFrame) -> tuple[Intrinsics | None, FocalLengthFrom | None]:
-    """Those of the camera at the stored frame's size, else what the EXIF tells of the lens."""
-    height_px, width_px = frame.rgb.shape[:2]
-    camera = of and stored_camera_of(of, width_px, height_px, frame.orientation)
-    if camera and camera.intrinsics:
-        return camera.intrinsics, "camera"
-    guess = draft_camera(frame.exif, width_px, height_px).lens
-    if guess.focal_length_mm is None or guess.pixel_pitch_um is None:
-        return None, None
-    lens = Lens(guess.focal_length_mm, 1.0, guess.pixel_pitch_um, guess.sensor_width_px or width_px)
-    return Intrinsics.centred(lens.fx_px(width_px), width_px, height_px), "exif"

@@ -1,6 +1,5 @@
 """``POST /photographs/preview``: a photograph as a picture that every browser shows."""
 
-from dataclasses import dataclass
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
@@ -15,15 +14,6 @@ from service.inference.encode import Encoded, encode_photograph
 from service.inference.images import ImageLimits, read_photograph
 
 router = APIRouter(prefix="/photographs", tags=["depth"])
-
-
-@dataclass(frozen=True, slots=True)
-class Order:
-    """Everything the work needs, so that it does not touch the request."""
-
-    upload: Upload
-    longest_px: int
-    limits: ImageLimits
 
 
 @router.post(
@@ -49,13 +39,13 @@ async def preview_photograph(
 ) -> Response:
     """What HEIC and raw files show, for browsers that do not read them. Nothing is stored."""
     upload = await receive_photograph(request)
-    order = Order(upload, longest_px, ImageLimits.of(settings))
-    encoded = (await unless_gone(request, worker.run(sharer, fulfil, order))).value
+    work = worker.run(sharer, _encoded, upload, longest_px, ImageLimits.of(settings))
+    encoded = (await unless_gone(request, work)).value
     return Response(encoded.body, media_type=encoded.media_type)
 
 
-def fulfil(cancellation: Cancellation, order: Order) -> Encoded:
+def _encoded(cancellation: Cancellation, upload: Upload, longest_px: int, limits: ImageLimits) -> Encoded:
     """Decode and encode: all the work of a request, in one thread."""
-    photograph = read_photograph(order.upload.data, order.upload.media_type, order.limits)
+    photograph = read_photograph(upload.data, upload.media_type, limits)
     cancellation.check()
-    return encode_photograph(photograph.rgb, order.longest_px)
+    return encode_photograph(photograph.rgb, longest_px)

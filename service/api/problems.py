@@ -109,46 +109,40 @@ def problem_response(error: CamindError) -> Response:
 
 
 TAKEN = "A camera 'd200' exists already: replace it with PUT /cameras/d200."
-EXAMPLES: dict[str, tuple[str, tuple[FieldProblem, ...]]] = {
-    "invalid-request": (
-        "lens.focal_length_mm: Input should be greater than or equal to 0.1",
-        (FieldProblem("#/lens/focal_length_mm", "Input should be greater than or equal to 0.1"),),
-    ),
-    "invalid-image": ("The jpeg file is cut off: it ends before the picture does.", ()),
+EXAMPLES = {
+    "invalid-request": "lens.focal_length_mm: Input should be greater than or equal to 0.1",
+    "invalid-image": "The jpeg file is cut off: it ends before the picture does.",
     "image-size-mismatch": (
-        "The photograph has 640x480 pixels upright, the camera 645x432: send the whole frame, not a crop.",
-        (),
+        "The photograph has 640x480 pixels upright, the camera 645x432: send the whole frame, not a crop."
     ),
     "idempotency-key-reused": (
-        "This Idempotency-Key came with another request before: send a new key with a new request.",
-        (),
+        "This Idempotency-Key came with another request before: send a new key with a new request."
     ),
-    "unauthorized": ("This API key is unknown, revoked or expired: ask the operator for another.", ()),
-    "forbidden": ("This API key lacks the scope depth: use one that has it.", ()),
-    "unknown-host": ("The service is not known by this name: add it to CAMIND_HOSTS, or serve with API keys.", ()),
+    "unauthorized": "This API key is unknown, revoked or expired: ask the operator for another.",
+    "forbidden": "This API key lacks the scope depth: use one that has it.",
+    "unknown-host": "The service is not known by this name: add it to CAMIND_HOSTS, or serve with API keys.",
     "cross-origin": (
-        "This was sent by another site's page: only the service's own page, and those of CAMIND_ORIGINS, may.",
-        (),
+        "This was sent by another site's page: only the service's own page, and those of CAMIND_ORIGINS, may."
     ),
-    "quota-exceeded": ("This API key has used its 600 requests of this minute: wait the seconds of Retry-After.", ()),
-    "not-found": ("There is no camera 'd200': register it with POST /cameras.", ()),
-    "conflict": (TAKEN, (FieldProblem("#/name", TAKEN),)),
-    "precondition-failed": ("Camera 'd200' is at revision 3: read it again, then repeat with If-Match: \"3\".", ()),
-    "too-large": ("The request body may have at most 40000000 bytes.", ()),
-    "unsupported-kind": ("Send JSON with the header Content-Type: application/json, not text/plain.", ()),
+    "quota-exceeded": "This API key has used its 600 requests of this minute: wait the seconds of Retry-After.",
+    "not-found": "There is no camera 'd200': register it with POST /cameras.",
+    "conflict": TAKEN,
+    "precondition-failed": "Camera 'd200' is at revision 3: read it again, then repeat with If-Match: \"3\".",
+    "too-large": "The request body may have at most 40000000 bytes.",
+    "unsupported-kind": "Send JSON with the header Content-Type: application/json, not text/plain.",
     "not-acceptable": (
         "No format fits this Accept header: ask for one of image/png, application/x-npy, application/x-npz, "
-        "image/tiff, application/x-ply, image/jpeg, application/json.",
-        (),
+        "image/tiff, application/x-ply, image/jpeg, application/json."
     ),
-    "receive-timeout": ("The request body came too slowly: less than 32 kB/s for 30 s.", ()),
-    "busy": ("17 requests run or wait, with room for no more: try again later.", ()),
-    "not-ready": ("The database cannot be used: the service's log says why.", ()),
-    "insufficient-storage": (
-        "The database's disk is full and nothing was changed: even to delete takes some room.",
-        (),
-    ),
-    "internal-error": ("Something went wrong here; the log has it under this X-Request-Id.", ()),
+    "receive-timeout": "The request body came too slowly: less than 32 kB/s for 30 s.",
+    "busy": "17 requests run or wait, with room for no more: try again later.",
+    "not-ready": "The database cannot be used: the service's log says why.",
+    "insufficient-storage": "The database's disk is full and nothing was changed: even to delete takes some room.",
+    "internal-error": "Something went wrong here; the log has it under this X-Request-Id.",
+}
+EXAMPLE_FAULTS = {
+    "invalid-request": FieldProblem("#/lens/focal_length_mm", "Input should be greater than or equal to 0.1"),
+    "conflict": FieldProblem("#/name", TAKEN),
 }
 
 
@@ -158,7 +152,8 @@ def responses(*errors: type[CamindError]) -> dict[int | str, dict[str, Any]]:
     every: tuple[type[CamindError], ...] = (*errors, CamindError)
     for error in every:
         entry = documented.setdefault(error.status, _empty_entry(error))
-        example = _told(error, *EXAMPLES[error.code]).model_dump(exclude_none=True)
+        faults = [EXAMPLE_FAULTS[error.code]] if error.code in EXAMPLE_FAULTS else []
+        example = _told(error, EXAMPLES[error.code], faults).model_dump(exclude_none=True)
         entry["content"][PROBLEM_TYPE]["examples"][error.code] = {"summary": error.title, "value": example}
     return documented
 

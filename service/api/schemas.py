@@ -102,11 +102,6 @@ class IntrinsicsRead(BaseModel):
     cy_px: float
     distortion: Annotated[list[float], Field(description="OpenCV's order")]
 
-    @classmethod
-    def from_domain(cls, intrinsics: Intrinsics) -> Self:
-        """The intrinsics as the physics has them."""
-        return cls.model_validate(intrinsics, from_attributes=True)
-
 
 class CameraSpecs(Given):
     """A camera: exactly one of ``k_cam_px`` and ``lens``."""
@@ -190,13 +185,7 @@ LENS_EXAMPLE: dict[str, JsonValue] = {
     "image_height_px": 432,
     "focus_distance_m": 2.0,
     "gamma_px": 0.5,
-    "lens": {
-        "focal_length_mm": 35,
-        "f_number": 2.8,
-        "pixel_pitch_um": 6.05,
-        "sensor_width_px": 3872,
-        "k_r": 4.0,
-    },
+    "lens": {"focal_length_mm": 35, "f_number": 2.8, "pixel_pitch_um": 6.05, "sensor_width_px": 3872, "k_r": 4.0},
 }
 
 
@@ -210,8 +199,8 @@ class CameraCreate(CameraSpecs):
     @classmethod
     def from_record(cls, record: CameraRecord) -> Self:
         """What registers a stored camera anew."""
-        camera, lens = record.camera, record.draft.lens
-        inner = IntrinsicsRead.from_domain(camera.intrinsics).model_dump() if camera.intrinsics else None
+        camera, lens, known = record.camera, record.draft.lens, record.camera.intrinsics
+        inner = asdict(known) | {"distortion": [*known.distortion]} if known else None
         return cls(
             name=record.name,
             image_width_px=camera.image_width_px,
@@ -300,27 +289,10 @@ class CameraRead(BaseModel):
     @classmethod
     def from_record(cls, record: CameraRecord) -> Self:
         """The stored camera, with what follows from it."""
-        draft, camera = record.draft, record.camera
-        near, far = camera.range_m
-        return cls(
-            name=record.name,
-            description=draft.description,
-            image_width_px=camera.image_width_px,
-            image_height_px=camera.image_height_px,
-            focus_distance_m=camera.focus_distance_m,
-            k_cam_px=camera.k_cam_px,
-            gamma_px=camera.gamma_px,
-            k_r=draft.k_r,
-            source=draft.source,
-            f_number=camera.f_number,
-            lens=_lens_read(draft.lens),
-            intrinsics=IntrinsicsRead.from_domain(camera.intrinsics) if camera.intrinsics else None,
-            fx_px=_fx_px(draft),
-            range_m=RangeRead(near=near, far=far),
-            revision=record.revision,
-            created_at=record.created_at,
-            updated_at=record.updated_at,
-        )
+        draft = record.draft
+        given = {"name": draft.name, "description": draft.description, "lens": _lens_read(draft.lens)}
+        stored = {"revision": record.revision, "created_at": record.created_at, "updated_at": record.updated_at}
+        return cls.model_validate(_numbers(draft) | given | stored)
 
 
 class CameraPage(BaseModel):
@@ -363,18 +335,7 @@ class PreviewRead(BaseModel):
     @classmethod
     def from_draft(cls, draft: CameraDraft, points: list[CurvePoint]) -> Self:
         """The camera of a draft, with what follows from it."""
-        camera = draft.camera
-        near, far = camera.range_m
-        return cls(
-            focus_distance_m=camera.focus_distance_m,
-            k_cam_px=camera.k_cam_px,
-            gamma_px=camera.gamma_px,
-            k_r=draft.k_r,
-            source=draft.source,
-            fx_px=_fx_px(draft),
-            range_m=RangeRead(near=near, far=far),
-            points=points,
-        )
+        return cls.model_validate(_numbers(draft) | {"points": points})
 
 
 class CurveRead(BaseModel):
@@ -386,9 +347,12 @@ class CurveRead(BaseModel):
     points: list[CurvePoint]
 
 
-def _fx_px(draft: CameraDraft) -> float | None:
-    known = draft.with_focal_length.intrinsics
-    return known.fx_px if known else None
+def _numbers(draft: CameraDraft) -> dict[str, object]:
+    """A camera's numbers and what follows from them, by their names on the wire."""
+    near, far = draft.camera.range_m
+    seen = draft.with_focal_length.intrinsics
+    told = {"k_r": draft.k_r, "source": draft.source, "fx_px": seen and seen.fx_px}
+    return asdict(draft.camera) | told | {"range_m": {"near": near, "far": far}}
 
 
 def _lens_read(lens: Lens | None) -> LensSpecs | None:

@@ -73,7 +73,6 @@ class Task:
 def calibrate(
     task: Task,
     pictures: Sequence[Picture],
-    *,
     tell: Tell = lambda _progress, _reports: None,
     check: Callable[[], None] = lambda: None,
 ) -> Report:

@@ -2,7 +2,7 @@
 
 import io
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 from xml.sax.saxutils import escape
@@ -109,20 +109,22 @@ def lay_out(grid: CircleGrid, paper: Paper) -> Sheet:
             "least: so fine a sheet is bought, and its calibration takes the same numbers"
         )
     width, height = grid.size_mm
-    for page in (PAPERS_MM[paper], PAPERS_MM[paper][::-1]):
-        room = (page[0] - 2 * MARGIN_MM, page[1] - 2 * MARGIN_MM - NOTES_MM)
+    for page, room in _pages(paper):
         if width <= room[0] and height <= room[1]:
             return _filled(grid, page, room)
     raise ValueError(f"the grid is {width:.0f} x {height:.0f} mm, too large for {paper}; {_what_fits(grid, paper)}")
 
 
+def _pages(paper: Paper) -> Iterator[tuple[tuple[float, float], tuple[float, float]]]:
+    """The sheet upright and across: its size, and the room for circles on it."""
+    for width, height in (PAPERS_MM[paper], PAPERS_MM[paper][::-1]):
+        yield (width, height), (width - 2 * MARGIN_MM, height - 2 * MARGIN_MM - NOTES_MM)
+
+
 def _what_fits(grid: CircleGrid, paper: Paper) -> str:
     width, height = grid.size_mm
-    factors = [
-        min((page[0] - 2 * MARGIN_MM) / width, (page[1] - 2 * MARGIN_MM - NOTES_MM) / height)
-        for page in (PAPERS_MM[paper], PAPERS_MM[paper][::-1])
-    ]
-    spacing_mm = math.floor(grid.spacing_mm * max(factors) * 10) / 10
+    factor = max(min(room[0] / width, room[1] / height) for _, room in _pages(paper))
+    spacing_mm = math.floor(grid.spacing_mm * factor * 10) / 10
     if grid.gap_mm / grid.spacing_mm * spacing_mm < LEAST_PRINTED_GAP_MM:
         return "nor does one whose circles do not touch: print fewer rows or columns"
     return f"at most {spacing_mm:.1f} mm spacing fits, with circles made smaller alike"

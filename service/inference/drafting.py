@@ -13,7 +13,7 @@ from functools import lru_cache
 import lensfunpy
 
 from service.inference.exif import FULL_FRAME_DIAGONAL_MM, Exif
-from service.optics.camera import FOCUS_DISTANCES_M
+from service.optics.camera import FOCUS_DISTANCES_M, Lens
 
 SENSOR_WIDTHS_MM = (1.0, 70.0)
 # of the long side to the short one; others are cut out of one of these
@@ -32,6 +32,12 @@ class LensGuess:
     f_number: float | None
     pixel_pitch_um: float | None
     sensor_width_px: int | None
+
+    def fx_px(self, image_width_px: int) -> float | None:
+        """Focal length in pixels of pictures so wide; None where it is not known."""
+        if self.focal_length_mm is None or self.pixel_pitch_um is None or self.sensor_width_px is None:
+            return None
+        return Lens(self.focal_length_mm, math.nan, self.pixel_pitch_um, self.sensor_width_px).fx_px(image_width_px)
 
 
 @dataclass(frozen=True, slots=True)

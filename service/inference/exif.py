@@ -5,7 +5,7 @@ import struct
 from dataclasses import dataclass, replace
 
 from service.errors import InvalidImage
-from service.inference.headers import TiffDirectory, exif_directories
+from service.inference.tiff import TiffDirectory, exif_directories
 from service.optics import thin_lens
 
 MAKE, MODEL = 271, 272
@@ -84,7 +84,7 @@ def thumbnail_in(exif: bytes) -> bytes:
     if start is None:
         return b""
     small = TiffDirectory(exif, start)
-    at, size = (next(iter(small.values(tag)), 0) for tag in (THUMBNAIL_START, THUMBNAIL_BYTES))
+    at, size = small.first(THUMBNAIL_START), small.first(THUMBNAIL_BYTES)
     return exif[at : at + size]
 
 

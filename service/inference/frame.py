@@ -2,13 +2,17 @@
 
 import math
 from collections.abc import Iterator
+from typing import Literal
 
 from service.errors import ImageSizeMismatch
+from service.inference.drafting import draft_camera
 from service.inference.exif import FULL_FRAME_DIAGONAL_MM, Exif
-from service.inference.images import TURNS, UNTURNS, Photograph
+from service.inference.images import TURNS, UNTURNS, Photograph, StoredFrame
 from service.metres import focus_in_words
 from service.optics import thin_lens
-from service.optics.camera import AS_INFINITY_M, FOCUS_DISTANCES_M, Camera, Lens
+from service.optics.camera import AS_INFINITY_M, FOCUS_DISTANCES_M, Camera, Intrinsics, Lens
+
+FocalLengthFrom = Literal["camera", "exif"]
 
 LENS_TOLERANCE = 0.05
 FOCUS_TOLERANCE = 0.15
@@ -19,26 +23,31 @@ MOST_OFF_MIDDLE = 1 / 8  # of width or height: a sensor is put into its camera b
 SAME_VIEW = 1.25  # equivalents are rounded, and count the whole of a sensor that 16:9 or a square is cut out of
 
 
-def stored_camera_of(camera: Camera, width_px: int, height_px: int, orientation: int) -> Camera | None:
-    """The camera at the size of a stored frame that is shown in this orientation; None where it is another's.
+def stored_intrinsics(frame: StoredFrame, camera: Camera | None) -> tuple[Intrinsics | None, FocalLengthFrom | None]:
+    """Those of the camera at a stored frame's size, if it is its frame, else what the EXIF tells of the lens."""
+    height_px, width_px = frame.rgb.shape[:2]
+    if camera is not None:
+        unturned = camera.turned(*TURNS[UNTURNS[frame.orientation]])
+        fitting = _fitting(width_px, height_px, camera, unturned)
+        if fitting and fitting.intrinsics:
+            return fitting.resized(width_px, height_px).intrinsics, "camera"
+    fx_px = draft_camera(frame.exif, width_px, height_px).lens.fx_px(width_px)
+    return (None, None) if fx_px is None else (Intrinsics.centred(fx_px, width_px, height_px), "exif")
 
-    A camera is registered with the size of its files or with that of its upright pictures.
-    """
-    unturned = camera.turned(*TURNS[UNTURNS[orientation]])
-    fitting = next((one for one in (camera, unturned) if one.is_same_frame(width_px, height_px)), None)
-    return fitting and fitting.resampled(width_px, height_px)
+
+def _fitting(width_px: int, height_px: int, *cameras: Camera) -> Camera | None:
+    """The first whose frame a picture is: one is registered with the size of its files or of its upright pictures."""
+    return next((camera for camera in cameras if camera.is_same_frame(width_px, height_px)), None)
 
 
 def camera_of(photograph: Photograph, camera: Camera) -> tuple[Camera, tuple[str, ...]]:
     """The camera turned and resized like the upright photograph, with warnings.
 
-    A camera is registered with the size of its files or with that of its upright pictures. Raises
-    ``ImageSizeMismatch`` for a picture that is not the whole frame.
+    Raises ``ImageSizeMismatch`` for a picture that is not the whole frame.
     """
     unlikely = tuple(_all_but_infinite(camera.focus_distance_m))
     width_px, height_px = photograph.width_px, photograph.height_px
-    turned = camera.turned(*TURNS[photograph.orientation])
-    fitting = next((one for one in (turned, camera) if one.is_same_frame(width_px, height_px)), None)
+    fitting = _fitting(width_px, height_px, camera.turned(*TURNS[photograph.orientation]), camera)
     if fitting is None:
         is_turned = camera.is_same_frame(height_px, width_px)
         advice = (

@@ -4,16 +4,16 @@ Each parser walks the file's structure once and believes no length that leads ou
 All raise ``InvalidImage`` for a file that is cut off or not of the form its kind prescribes.
 """
 
-import math
 import re
 import struct
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 from service.errors import InvalidImage, UnsupportedKind
 from service.inference.heic import curve_of_primary, exif_item, is_animated, kind_of, primary_picture
+from service.inference.tiff import ORIENTATION, TiffDirectory, exif_orientation
 from service.inference.tone_curve import CURVES, LINEAR, SRGB, curve_of_profile, unpacked_profile
 from service.inference.vp8 import quality as quality_of_vp8
 
@@ -40,9 +40,8 @@ JPEG_END, JPEG_SCAN, JPEG_STEPS, JPEG_APP1, JPEG_APP2 = 0xD9, 0xDA, 0xDB, 0xE1, 
 JPEG_STEPS_OF_50 = 3688  # all 64 of luminance together, where quality is 50 (ITU-T T.81, annex K)
 JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 JPEG_BARE = frozenset({0x01, 0xD8, *range(0xD0, 0xD8)})
-TIFF_WIDTH, TIFF_HEIGHT, TIFF_BITS, TIFF_ORIENTATION, TIFF_SAMPLE_FORMAT = 256, 257, 258, 274, 339
+TIFF_BITS, TIFF_SAMPLE_FORMAT = 258, 339
 TIFF_NEW_SUBFILE = 254
-TIFF_STORES = ((273, 279), (324, 325))
 TIFF_PLANAR = 284
 TIFF_PHOTOMETRIC, TIFF_SUB_DIRECTORIES, TIFF_DNG_VERSION = 262, 330, 50706
 # photometric interpretations of sensor values: a filter array, and the same after demosaicing
@@ -52,15 +51,7 @@ TIFF_RGB, TIFF_RGBA_SAMPLES = 2, 4
 TIFF_EXTRA_SAMPLES, TIFF_ALPHA = 338, frozenset({1, 2})
 CR2_MARK = b"CR"
 MOST_DIRECTORIES = 16
-TIFF_TYPES = {1: "B", 3: "H", 4: "I", 13: "I"}
-TIFF_TYPE_BYTES = dict(enumerate((0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4, 0, 0, 8, 8, 8)))
-# with those that are no whole numbers: a rational is two
-TIFF_NUMBERS = {**TIFF_TYPES, 5: "II", 10: "ii", 11: "f", 12: "d"}
-INFINITY = 2**32 - 1  # above a fraction
-TIFF_TEXT, TIFF_MOST_TEXT = 2, 256
-EXIF_DIRECTORY, TIFF_PROFILE, TIFF_XMP = 34665, 34675, 700
-TIFF_MAX_VALUES = 100_000
-TIFF_MAX_ENTRIES = 4_096
+TIFF_PROFILE, TIFF_XMP = 34675, 700
 TIFF_TILE_SIZE = (322, 323)
 TIFF_SMALL_TILE_PIXELS = 2**20
 # of one file: a part costs its reader time, and a scan of a jpeg costs its decoder a pass over the whole picture
@@ -159,7 +150,7 @@ def _jpeg(data: bytes) -> Header:
     if size is None:
         raise InvalidImage("The jpeg file holds no picture.")
     curve = curve_of_profile(profile)
-    return Header("jpeg", *size, _exif_orientation(exif), exif=exif, curve=curve, quality=quality, xmp=xmp)
+    return Header("jpeg", *size, exif_orientation(exif), exif=exif, curve=curve, quality=quality, xmp=xmp)
 
 
 def _jpeg_quality(tables: bytes) -> float:
@@ -203,7 +194,7 @@ def _png(data: bytes) -> Header:
             found[name] = payload
     width, height, bits, colours = struct.unpack_from(">IIBB", found.get(b"IHDR", b"").ljust(10, b"\0"))
     exif, frames = found.get(b"eXIf", b""), int.from_bytes(found.get(b"acTL", b"")[:4], "big")
-    orientation, has_more = _exif_orientation(exif), frames > 1
+    orientation, has_more = exif_orientation(exif), frames > 1
     few, curve = bits < 8 or colours == PNG_PALETTE, _png_curve(found)
     clear = colours & PNG_ALPHA or (colours != PNG_GREY and PNG_CLEAR in found)  # its decoder knows no other
     header = Header("png", width, height, orientation, None, exif, has_more, curve, xmp=xmp)
@@ -278,7 +269,7 @@ def _webp(data: bytes) -> Header:
         raise _too_many_parts("webp")
     if size is None:
         raise InvalidImage("The webp file holds no picture.")
-    curve, orientation = curve_of_profile(profile), _exif_orientation(exif)
+    curve, orientation = curve_of_profile(profile), exif_orientation(exif)
     return Header("webp", *size, orientation, None, exif, frames > 1, curve, quality, xmp, has_alpha=clear)
 
 
@@ -299,7 +290,7 @@ def _tiff(data: bytes) -> Header:
     directory.require_stored()
     sensor = _sensor_size(data, directory)
     if sensor is not None:
-        return Header("raw", *sensor, directory.orientation(), exif=data)
+        return Header("raw", *sensor, directory.orientation, exif=data)
     if 3 in directory.values(TIFF_SAMPLE_FORMAT):
         raise UnsupportedKind("A tiff of floating-point numbers is no photograph: send 8 or 16 bits, sRGB.")
     if not {*(directory.values(TIFF_BITS) or [1])} <= {8, 16}:
@@ -307,20 +298,20 @@ def _tiff(data: bytes) -> Header:
     directory.require_own_bytes()
     _require_usual(directory)
     _require_tiles(directory)
-    at = directory.offset_of(TIFF_ORIENTATION)
+    at = directory.offset_of(ORIENTATION)
     has_more, curve = _has_more_pages(data, directory), curve_of_profile(directory.bytes_of(TIFF_PROFILE))
     xmp, few = directory.bytes_of(TIFF_XMP), TIFF_PALETTE in directory.values(TIFF_PHOTOMETRIC)
-    size, orientation, clear = directory.size, directory.orientation(), _has_alpha(directory)
+    size, orientation, clear = directory.size, directory.orientation, _has_alpha(directory)
     return Header("tiff", *size, orientation, at, data, has_more, curve, xmp=xmp, has_few_colours=few, has_alpha=clear)
 
 
-def _has_alpha(directory: "TiffDirectory") -> bool:
+def _has_alpha(directory: TiffDirectory) -> bool:
     is_rgba = len(directory.values(TIFF_BITS)) == TIFF_RGBA_SAMPLES and TIFF_RGB in directory.values(TIFF_PHOTOMETRIC)
     is_interleaved = 2 not in directory.values(TIFF_PLANAR)
     return is_rgba and is_interleaved and not TIFF_ALPHA.isdisjoint(directory.values(TIFF_EXTRA_SAMPLES))
 
 
-def _require_usual(directory: "TiffDirectory") -> None:
+def _require_usual(directory: TiffDirectory) -> None:
     """What the decoder takes for something else: a small copy for its picture; in 16 bits colours one after the other,
     and white as 0.
     """
@@ -334,7 +325,7 @@ def _require_usual(directory: "TiffDirectory") -> None:
         raise UnsupportedKind("A tiff of 16 bits whose 0 is white is not read: store black as 0.")
 
 
-def _has_more_pages(data: bytes, first: "TiffDirectory") -> bool:
+def _has_more_pages(data: bytes, first: TiffDirectory) -> bool:
     """Whether pages follow; a smaller copy of the first is none."""
     try:
         pages = [TiffDirectory(data, start) for start in first.following(MOST_DIRECTORIES)]
@@ -343,19 +334,19 @@ def _has_more_pages(data: bytes, first: "TiffDirectory") -> bool:
         return False
 
 
-def _is_small_copy(page: "TiffDirectory") -> bool:
-    return bool(1 & next(iter(page.values(TIFF_NEW_SUBFILE)), 0))
+def _is_small_copy(page: TiffDirectory) -> bool:
+    return bool(1 & page.first(TIFF_NEW_SUBFILE))
 
 
-def _require_tiles(directory: "TiffDirectory") -> None:
+def _require_tiles(directory: TiffDirectory) -> None:
     """Tiles far larger than the picture, which a decoder makes room for, mean harm."""
     width, height = directory.size
-    across, down = (next(iter(directory.values(tag)), 0) for tag in TIFF_TILE_SIZE)
+    across, down = (directory.first(tag) for tag in TIFF_TILE_SIZE)
     if across * down > max(TIFF_SMALL_TILE_PIXELS, 2 * width * height):
         raise InvalidImage(f"The tiff file states tiles of {across}x{down} pixels for {width}x{height} pixels.")
 
 
-def _sensor_size(data: bytes, first: "TiffDirectory") -> tuple[int, int] | None:
+def _sensor_size(data: bytes, first: TiffDirectory) -> tuple[int, int] | None:
     """The size of the largest picture where the file holds a sensor's values, None for any other tiff."""
     starts = [*first.values(TIFF_SUB_DIRECTORIES)[:MOST_DIRECTORIES], *first.following(MOST_DIRECTORIES)]
     directories = [first, *(TiffDirectory(data, start) for start in starts)]
@@ -373,132 +364,6 @@ def _heic(data: bytes) -> Header:
 
 def _avif(data: bytes) -> Header:
     return replace(_heic(data), kind="avif", has_more=is_animated(data))
-
-
-def _exif_orientation(data: bytes) -> int:
-    """Orientation 1..8 from an EXIF block; a block that cannot be read says nothing, which is 1."""
-    try:
-        return TiffDirectory(data).orientation()
-    except (struct.error, InvalidImage):
-        return 1
-
-
-def exif_directories(exif: bytes) -> "tuple[TiffDirectory, TiffDirectory | None]":
-    """The main directory of an EXIF block and that of the shot; ``InvalidImage`` or ``struct.error`` for no such."""
-    main = TiffDirectory(exif)
-    start = next(iter(main.values(EXIF_DIRECTORY)), None)
-    return main, None if start is None else TiffDirectory(exif, start)
-
-
-class TiffDirectory:
-    """A directory of a TIFF structure, the form of EXIF too: the first, or the one at ``start``."""
-
-    def __init__(self, data: bytes, start: int | None = None) -> None:
-        if data[:4] not in (b"II*\x00", b"MM\x00*"):
-            raise InvalidImage("The file has no TIFF header.")
-        self._data = data
-        self._order = "<" if data[:2] == b"II" else ">"
-        if start is None:
-            (start,) = self._unpack("I", 4)
-        (count,) = self._unpack("H", start)
-        if count > TIFF_MAX_ENTRIES:
-            raise InvalidImage(f"The file's TIFF directory states {count} entries.")
-        self._end = start + 2 + 12 * count
-        self._places = range(start + 2, self._end, 12)
-        # of a tag that comes twice, decoders take the first
-        self._entries = {self._unpack("H", at)[0]: at for at in reversed(self._places)}
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height, 0 where they are missing."""
-        width, height = (next(iter(self.values(tag)), 0) for tag in (TIFF_WIDTH, TIFF_HEIGHT))
-        return width, height
-
-    def following(self, most: int) -> Iterator[int]:
-        """Where the directories after this one begin, as far as they can be read."""
-        at = self._end
-        for _ in range(most):
-            try:
-                (start,) = self._unpack("I", at)
-                (count,) = self._unpack("H", start) if start else (0,)
-            except struct.error:
-                return
-            if not count:
-                return
-            yield start
-            at = start + 2 + 12 * count
-
-    def require_stored(self) -> None:
-        """Raises ``InvalidImage`` where its picture leads out of the file."""
-        if any(offset + count > len(self._data) for offset, count in self._stored()):
-            raise InvalidImage.cut_off("tiff")
-
-    def require_own_bytes(self) -> None:
-        """Raises ``InvalidImage`` where parts share bytes: each costs a decoder its time and memory anew."""
-        stated = (self._unpack("HI", at + 2) for at in self._places)
-        described = sum(TIFF_TYPE_BYTES.get(kind, 0) * count for kind, count in stated)
-        if described + sum(count for _, count in self._stored()) > len(self._data):
-            raise InvalidImage("The parts that the tiff file states are larger than the file: store it anew.")
-
-    def _stored(self) -> Iterator[tuple[int, int]]:
-        """Where the parts of its picture begin, and their bytes."""
-        for offsets, counts in TIFF_STORES:
-            yield from zip(self.values(offsets), self.values(counts), strict=False)
-
-    def _unpack(self, form: str, at: int) -> tuple[Any, ...]:
-        return struct.unpack_from(self._order + form, self._data, at)
-
-    def offset_of(self, tag: int) -> int | None:
-        """Where a tag's first value stands in the file, or None without the tag."""
-        entry = self._entries.get(tag)
-        if entry is None:
-            return None
-        kind, count = self._unpack("HI", entry + 2)
-        size = struct.calcsize("=" + ("s" if kind == TIFF_TEXT else TIFF_NUMBERS.get(kind, "I"))) * count
-        return entry + 8 if size <= 4 else self._unpack("I", entry + 8)[0]
-
-    def values(self, tag: int) -> tuple[int, ...]:
-        """A tag's whole numbers; empty without the tag or for another type."""
-        at = self.offset_of(tag)
-        if at is None:
-            return ()
-        kind, count = self._unpack("HI", self._entries[tag] + 2)
-        if kind not in TIFF_TYPES:
-            return ()
-        if count > TIFF_MAX_VALUES:
-            raise InvalidImage(f"The tiff file states {count} values for tag {tag}.")
-        return self._unpack(f"{count}{TIFF_TYPES[kind]}", at)
-
-    def bytes_of(self, tag: int) -> bytes:
-        """A tag's bytes, from where they begin; empty without the tag."""
-        at = self.offset_of(tag)
-        return b"" if at is None else self._data[at : at + self._unpack("I", self._entries[tag] + 4)[0]]
-
-    def number(self, tag: int, infinity: float | None = None) -> float | None:
-        """A tag's first number, of any type; None without one that is positive and finite (all ones: ``infinity``)."""
-        at = self.offset_of(tag)
-        if at is None:
-            return None
-        (kind,) = self._unpack("H", self._entries[tag] + 2)
-        if kind not in TIFF_NUMBERS:
-            return None
-        over, *under = self._unpack(TIFF_NUMBERS[kind], at)
-        if over == INFINITY:
-            return infinity
-        value = over / (under[0] or math.nan) if under else over
-        return value if 0 < value < math.inf else None
-
-    def text(self, tag: int) -> str:
-        """A tag's text up to its end; empty without one."""
-        at = self.offset_of(tag)
-        kind, count = (0, 0) if at is None else self._unpack("HI", self._entries[tag] + 2)
-        if at is None or kind != TIFF_TEXT:
-            return ""
-        return self._data[at : at + min(count, TIFF_MOST_TEXT)].partition(b"\0")[0].decode("utf-8", "ignore")
-
-    def orientation(self) -> int:
-        value = next(iter(self.values(TIFF_ORIENTATION)), 1)
-        return value if 1 <= value <= 8 else 1
 
 
 PARSERS: dict[Kind, Callable[[bytes], Header]] = {

@@ -1,7 +1,6 @@
 """Large photographs in overlapping tiles, so that memory follows the tile and not the photograph."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,14 +9,6 @@ PIXEL_BUDGET = 6_500_000
 OVERLAP_PX = 224
 
 Maps = dict[str, NDArray[np.float32]]
-
-
-@dataclass(frozen=True, slots=True)
-class Span:
-    """Pixels ``start`` (included) to ``stop`` (excluded) along one axis."""
-
-    start: int
-    stop: int
 
 
 def read_in_tiles(
@@ -42,7 +33,7 @@ def read_in_tiles(
     weights = {step: [fades(along, step) for along in (rows, columns)] for step in (stride, multiple)}
     for down, row in enumerate(rows):
         for across, column in enumerate(columns):
-            for name, values in read(rgb[row.start : row.stop, column.start : column.stop]).items():
+            for name, values in read(rgb[row, column]).items():
                 step = stride if values.ndim == 2 else multiple
                 size = (*values.shape[:-2], -(-height // step), -(-width // step))
                 weight = np.outer(weights[step][0][down], weights[step][1][across])
@@ -52,7 +43,7 @@ def read_in_tiles(
     return merged
 
 
-def layout(height: int, width: int, multiple: int, pixel_budget: int) -> tuple[list[Span], list[Span]]:
+def layout(height: int, width: int, multiple: int, pixel_budget: int) -> tuple[list[slice], list[slice]]:
     """Rows and columns of tiles of at most ``pixel_budget``, so that the least is read twice.
 
     No tile is narrower than two overlaps, whatever the budget.
@@ -75,16 +66,14 @@ def _side(size: int, count: int, multiple: int) -> int:
     return -(-(size + (count - 1) * (OVERLAP_PX + multiple)) // (count * multiple)) * multiple
 
 
-def spans(size: int, count: int, multiple: int) -> list[Span]:
+def spans(size: int, count: int, multiple: int) -> list[slice]:
     """So many even spans that cover ``size`` and overlap by ``OVERLAP_PX`` or more, each from a multiple."""
     side = _side(size, count, multiple)
-    starts = (
-        [(size - side) * place // (count - 1) // multiple * multiple for place in range(count)] if count > 1 else [0]
-    )
-    return [Span(start, min(start + side, size)) for start in starts[:-1]] + [Span(starts[-1], size)]
+    starts = [(size - side) * place // max(1, count - 1) // multiple * multiple for place in range(count)]
+    return [slice(start, min(start + side, size)) for start in starts[:-1]] + [slice(starts[-1], size)]
 
 
-def fades(along: list[Span], stride: int) -> list[NDArray[np.float32]]:
+def fades(along: list[slice], stride: int) -> list[NDArray[np.float32]]:
     """A weight per map pixel of each span: it falls softly towards neighbours, and all sum to 1 everywhere."""
     total = np.zeros(-(-along[-1].stop // stride))
     weights = []

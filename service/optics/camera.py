@@ -135,6 +135,12 @@ class Camera:
         far = thin_lens.farthest_depth(self.focus_distance_m, self.k_cam_px, RANGE_BLUR_ERROR_PX, RANGE_DEPTH_ERROR)
         return min(self.focal_length_m or 0.0, far), far
 
+    @property
+    def middle_m(self) -> float:
+        """What a curve of blur is drawn around: the plane in focus, or the range's end if that is all but infinity."""
+        focus_m = self.focus_distance_m
+        return min(focus_m, self.range_m[1]) if focus_m >= AS_INFINITY_M else focus_m
+
     def is_same_frame(self, width_px: int, height_px: int) -> bool:
         """Whether an image of this size can be this camera's whole frame, resized (same aspect to 1 %)."""
         aspect = (width_px / height_px) / (self.image_width_px / self.image_height_px)

@@ -18,13 +18,11 @@ V = TypeVar("V", bound=Values)
 def decode_srgb(encoded: V) -> V:
     """sRGB values in 0..1 to linear light, of the same shape and type."""
     is_dark = encoded <= 0.04045
-    linear: V = encoded / 12.92 * is_dark + ((encoded.clip(0.04, None) + 0.055) / 1.055) ** 2.4 * ~is_dark
-    return linear
+    return encoded / 12.92 * is_dark + ((encoded.clip(0.04, None) + 0.055) / 1.055) ** 2.4 * ~is_dark
 
 
 def encode_srgb(linear: V) -> V:
     """Linear light, cut off at 0 and 1, to sRGB values, of the same shape and type."""
     clipped = linear.clip(0, 1)
     is_dark = clipped <= 0.0031308
-    encoded: V = clipped * 12.92 * is_dark + (1.055 * clipped.clip(1e-4, None) ** (1 / 2.4) - 0.055) * ~is_dark
-    return encoded
+    return clipped * 12.92 * is_dark + (1.055 * clipped.clip(1e-4, None) ** (1 / 2.4) - 0.055) * ~is_dark

@@ -51,26 +51,22 @@ def k_cam(
 
 def relative_defocus(depth_m: Q, focus_distance_m: Q | float) -> Q:
     """x = |s1 - z| / z, without unit: 0 in focus, unbounded nearer, below 1 beyond."""
-    x: Q = abs(focus_distance_m - depth_m) / depth_m
-    return x
+    return abs(focus_distance_m - depth_m) / depth_m
 
 
 def signed_defocus(depth_m: Q, focus_distance_m: Q | float) -> Q:
     """d = 1 - s1 / z: negative nearer than focus, 0 in focus, positive (below 1) beyond."""
-    d: Q = (depth_m - focus_distance_m) / depth_m
-    return d
+    return (depth_m - focus_distance_m) / depth_m
 
 
 def defocus_at_depth(depth_m: Q, focus_distance_m: Q | float, k_cam_px: Q | float) -> Q:
     """sigma in pixels of a point at depth z (eq. 3)."""
-    sigma: Q = relative_defocus(depth_m, focus_distance_m) * k_cam_px
-    return sigma
+    return relative_defocus(depth_m, focus_distance_m) * k_cam_px
 
 
 def blur_from_defocus(defocus_px: Q, gamma_px: Q | float) -> Q:
     """lambda = sqrt(sigma^2 + gamma^2) in pixels: what the image shows (eq. 5)."""
-    blur: Q = (defocus_px * defocus_px + gamma_px * gamma_px) ** 0.5
-    return blur
+    return (defocus_px * defocus_px + gamma_px * gamma_px) ** 0.5
 
 
 def averaging_variance(from_px: int, to_px: int) -> float:
@@ -131,14 +127,12 @@ def defocus_from_blur(blur_px: Q, gamma_px: Q | float, floor_px: float = 0.0) ->
     a small positive floor; a request passes none.
     """
     variance = blur_px * blur_px - gamma_px * gamma_px
-    sigma: Q = ((variance + abs(variance)) / 2.0 + floor_px * floor_px) ** 0.5
-    return sigma
+    return ((variance + abs(variance)) / 2.0 + floor_px * floor_px) ** 0.5
 
 
 def relative_defocus_from_blur(blur_px: Q, gamma_px: Q | float, k_cam_px: Q | float, floor_px: float = 0.0) -> Q:
     """x = sqrt(lambda^2 - gamma^2) / k_cam, without unit (eq. 7)."""
-    x: Q = defocus_from_blur(blur_px, gamma_px, floor_px) / k_cam_px
-    return x
+    return defocus_from_blur(blur_px, gamma_px, floor_px) / k_cam_px
 
 
 def relative_defocus_spread(
@@ -152,26 +146,22 @@ def relative_defocus_spread(
     high = blur_px * (relative_error + 1.0)
     x_low = relative_defocus_from_blur(low, gamma_px, k_cam_px, floor_px)
     x_high = relative_defocus_from_blur(high, gamma_px, k_cam_px, floor_px)
-    spread: Q = (x_high - x_low) / 2.0
-    return spread
+    return (x_high - x_low) / 2.0
 
 
 def depth_near(relative_defocus: Q, focus_distance_m: Q | float) -> Q:
     """z = s1 / (1 + x) in metres: the answer on the near side, for every x >= 0."""
-    z: Q = focus_distance_m / (relative_defocus + 1.0)
-    return z
+    return focus_distance_m / (relative_defocus + 1.0)
 
 
 def depth_far(relative_defocus: Q, focus_distance_m: Q | float) -> Q:
     """z = s1 / (1 - x) in metres: the answer on the far side, which exists only for x < 1."""
-    z: Q = focus_distance_m / (1.0 - relative_defocus)
-    return z
+    return focus_distance_m / (1.0 - relative_defocus)
 
 
 def depth_error(depth_m: Q, focus_distance_m: Q | float, k_cam_px: Q | float, defocus_error_px: Q | float) -> Q:
     """dz = z^2 / (s1 k_cam) dsigma in metres: the floor under every depth error."""
-    dz: Q = depth_m * depth_m / (focus_distance_m * k_cam_px) * defocus_error_px
-    return dz
+    return depth_m * depth_m / (focus_distance_m * k_cam_px) * defocus_error_px
 
 
 def farthest_depth(
@@ -197,8 +187,7 @@ def depth_at_focus(depth_m: Q, old_focus_m: float, new_focus_m: float) -> Q:
     sigma is k_cam s1 |1/z - 1/s1| (eq. 3): with k_cam s1 kept, what is as far from focus in inverse depth is as
     blurred. What would be farther than infinity is no positive number.
     """
-    moved: Q = depth_m / (depth_m * (1 / new_focus_m - 1 / old_focus_m) + 1.0)
-    return moved
+    return depth_m / (depth_m * (1 / new_focus_m - 1 / old_focus_m) + 1.0)
 
 
 def image_distance_in_focal_lengths(focus_distance_m: float, focal_length_m: float) -> float:

@@ -91,7 +91,7 @@ def test_a_worker_that_fails_is_said(tmp_path: Path) -> None:
     broken = tmp_path / "python"
     broken.write_text("#!/bin/sh\necho no blender here\nexit 3\n")
     broken.chmod(0o755)
-    with pytest.raises(RuntimeError, match="no blender here"):
+    with pytest.raises(ChildProcessError, match="no blender here"):
         render(broken, rooms(1), tmp_path / "out")
 
 
@@ -102,7 +102,7 @@ def test_an_environment_that_cannot_be_made_is_said_and_leaves_what_was_there(
     broken.write_text("#!/bin/sh\necho no room >&2\nexit 1\n")
     broken.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(RuntimeError, match="no room"):
+    with pytest.raises(ChildProcessError, match="no room"):
         environment(tmp_path)
     assert broken.exists()
 

@@ -10,12 +10,11 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from model_export.band_energy import LUMINANCE, BandEnergy
 from model_export.batch_norms import folded
 from model_export.config import Kind, TrainConfig
 from model_export.losses import STANDING_OUT, Batch, correct, laplace, run_pair, standing_out, total_loss
 from model_export.networks import (
-    LUMINANCE,
-    BandEnergy,
     BlurEstimate,
     Conditioning,
     DepthEstimate,

@@ -16,7 +16,6 @@ from model_export.render import (
     Spreads,
     blur,
     blur_varying,
-    composite,
     refocus,
     render_layers,
     sampled_taps,
@@ -181,11 +180,6 @@ def test_a_pixel_belongs_to_the_layer_most_of_its_light_is_from() -> None:
         _, front = render_layers([bar, behind], GAUSSIAN)
         assert (front[:, 46:50] == (0 if shown else 1)).all()
         assert (front[:, :36] == 1).all()
-
-
-def test_nothing_to_render_is_an_error() -> None:
-    with pytest.raises(ValueError, match="no layers"):
-        composite([])
 
 
 def test_srgb_survives_the_round_trip() -> None:
