@@ -38,7 +38,7 @@ from service.inference.exif import read_exif
 from service.inference.headers import read_header
 from service.inference.making import noted_making
 from service.optics import thin_lens
-from service.optics.camera import AS_INFINITY_M, RANGE_BLUR_ERROR_PX, Camera
+from service.optics.camera import RANGE_BLUR_ERROR_PX, Camera
 from service.storage.cameras import CameraRecord
 from service.storage.idempotency import once_of
 

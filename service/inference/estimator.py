@@ -139,18 +139,17 @@ class Estimator:
         height, width = rgb.shape[:2]
         if (width, height) != (camera.image_width_px, camera.image_height_px):
             raise ValueError(f"the camera must be that of a {width}x{height} image: resize it first")
-        asked = _Request(rgb, camera, side, cancellation or Cancellation(), part)
-        asked = asked.without(hidden, "what is transparent")
-        asked = asked.without(black_border(asked.rgb), "a black border")
-        request, clues = self._heard(asked, known)
+        request = _Request(rgb, camera, side, cancellation or Cancellation(), part)
+        request = request.without(hidden, "what is transparent")
+        request = request.without(black_border(request.rgb), "a black border")
+        request, clues = self._heard(request, known)
         request, read = self._read_sharp(request)
-        area, stopwatch = read.area, request.stopwatch
-        size = (area.height_px, area.width_px)
+        area, size = read.area, (read.area.height_px, read.area.width_px)
         reading, told = self._reading(request, read, clues)
         if area.height_px * area.width_px > SMALL_PX:
             self._freeing.ask()  # what a large picture has taken is kept for the next one, but for a while only
         request.cancellation.check()
-        with stopwatch.stage("encode"):
+        with request.stopwatch.stage("encode"):
             depth_m, valid = decide(reading, size)
         answer = DepthMap(
             depth_m=depth_m,
@@ -159,7 +158,7 @@ class Estimator:
             camera=area.behind(request.camera),
             scales=read.scales,
             warnings=(),
-            timings_ms=stopwatch.elapsed_ms,
+            timings_ms=request.stopwatch.elapsed_ms,
         )
         blur_px = reading.blur_px
         if part is not None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from service.inference.artifact import load_model_folder
 from service.inference.estimator import Estimator
 from service.inference.pair import GraphPair
-from service.inference.tiles import OVERLAP_PX, PIXEL_BUDGET, Span, fades, layout, read_in_tiles, spans
+from service.inference.tiles import OVERLAP_PX, PIXEL_BUDGET, fades, layout, read_in_tiles, spans
 from service.opencv import cv2
 from service.optics.camera import Camera
 from tests.inference.oracle_pair import build_oracle_pair
@@ -32,8 +32,8 @@ def test_spans_cover_everything_and_overlap_enough(size: int, count: int) -> Non
     assert max(sizes) - min(sizes) <= 16 * len(found)
 
 
-def longest(along: list[Span]) -> int:
-    return max(span.stop - span.start for span in along)
+def longest(along: list[slice]) -> int:
+    return max(int(span.stop - span.start) for span in along)
 
 
 @pytest.mark.parametrize(
