@@ -58,6 +58,9 @@ class Server:
         with self._log.open("w") as log:
             # away from the checkout, whose packages would hide those of another installation
             self.process = subprocess.Popen(command, env=environment, stderr=log, cwd=data_dir.parent)
+        self.port = 0
+
+    def wait_until_ready(self) -> None:
         self.port = self._wait_for_port()
         self.poll(lambda: self.ask("GET", "/health/ready").status == 200)
 
@@ -129,6 +132,7 @@ def serving(
     """A server for a while; killed at the end if it still runs."""
     server = Server(data_dir, arguments, camind, settings or {})
     try:
+        server.wait_until_ready()
         yield server
     finally:
         if server.process.poll() is None:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.calibration import fit
-from service.calibration.developed import sharpened, toned
 from service.calibration.edge import PointSpread, find_spread, fit_again
 from service.calibration.measure import (
     LEAST_CIRCLES,
@@ -24,6 +23,7 @@ from service.calibration.measure import (
 from service.calibration.pose import Placement, PoseError, place
 from service.calibration.refocus import refocused
 from service.calibration.report import Method, PictureReport, Report, Result, Role, Sample
+from service.calibration.sharpening import sharpened
 from service.calibration.solve import FEW_VIEWS
 from service.calibration.target import CircleGrid
 from service.errors import CamindError
@@ -181,7 +181,7 @@ def _result(task: Task, measured: list[Measured], at: Callable[[float], None]) -
 def _altered(found: _Fitted, constants: fit.Constants) -> tuple[str, ...]:
     """What tells that blur is not that of one lens alone, locked."""
     edges = [edge for one in found.usable for edge in one.edges]
-    return (*sharpened(edges, found.spread), *toned(found.usable), *refocused(found.circles, constants))
+    return (*sharpened(edges, found.spread), *refocused(found.circles, constants))
 
 
 def _fitted(task: Task, usable: list[Measured], size_px: tuple[int, int], at: Callable[[float], None]) -> _Fitted:
