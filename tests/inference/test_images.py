@@ -188,7 +188,6 @@ def test_alpha_that_hides_nothing_or_all_of_it_says_nothing() -> None:
         np.testing.assert_array_equal(photograph.rgb, corners())
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="others do not bound memory")
 def test_too_little_memory_is_no_damage_to_a_file_or_a_graph(tiny_model_dir: Path) -> None:
     done = subprocess.run([sys.executable, "-c", IN_LITTLE_MEMORY, tiny_model_dir], check=False, capture_output=True)
     assert done.stdout.split() == [b"decoding", b"running"], done.stderr

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from service.inference.artifact import load_model_folder
 from service.inference.cancellation import Cancellation
 from service.inference.copies import Read
+from service.inference.depth_map import DepthMap
 from service.inference.estimator import Estimator
 from service.inference.known import LIKE_BLUR, REACH, Clues, KnownDepth
 from service.inference.pair import GraphPair, RawMaps, Side, Sights
@@ -61,25 +62,26 @@ def test_the_answer_is_by_the_camera_focused_where_known_depths_say(estimator: E
     assert "where 2 m was told" in corrected.warnings[0]
 
 
-def test_the_focus_follows_from_known_depths_where_it_is_far_away_too(estimator: Estimator) -> None:
-    told = Camera(384, 256, 20.0, 1.5, 0.5)
-    true, depths_m = told.focused_at(16.0), (4.0, 10.0)
+def of_halves(
+    estimator: Estimator, told: Camera, true_m: float, depths_m: tuple[float, float]
+) -> tuple[DepthMap, tuple[KnownDepth, ...]]:
+    """What is answered of two halves at known depths, by a camera focused elsewhere than it is told; and these."""
+    blur_px = [told.focused_at(true_m).blur_px(depth_m) for depth_m in depths_m]
     picture = np.empty((256, 384, 3), np.uint8)
-    picture[:, :192], picture[:, 192:] = (brightness_for(true.blur_px(depth_m)) for depth_m in depths_m)
+    picture[:, :192], picture[:, 192:] = map(brightness_for, blur_px)
     known = tuple(replace(point, depth_m=depth_m) for point, depth_m in zip(KNOWN, depths_m, strict=True))
-    answer = estimator.estimate(picture, told, known=known)
+    return estimator.estimate(picture, told, known=known), known
+
+
+def test_the_focus_follows_from_known_depths_where_it_is_far_away_too(estimator: Estimator) -> None:
+    answer, known = of_halves(estimator, Camera(384, 256, 20.0, 1.5, 0.5), 16.0, (4.0, 10.0))
     assert answer.camera.focus_distance_m == pytest.approx(16.0, rel=0.1)
     for point in known:
         assert answer.depth_m[int(point.v), int(point.u)] == pytest.approx(point.depth_m, rel=0.03)
 
 
 def test_a_lens_told_to_be_at_infinity_is_answered_as_it_is_focused_and_told_of_in_words(estimator: Estimator) -> None:
-    told = Camera(384, 256, 100_000.0, 7.6e-5, 0.5)
-    true, depths_m = told.focused_at(3.0), (0.8, 1.5)
-    picture = np.empty((256, 384, 3), np.uint8)
-    picture[:, :192], picture[:, 192:] = (brightness_for(true.blur_px(depth_m)) for depth_m in depths_m)
-    known = tuple(replace(point, depth_m=depth_m) for point, depth_m in zip(KNOWN, depths_m, strict=True))
-    answer = estimator.estimate(picture, told, known=known)
+    answer, _ = of_halves(estimator, Camera(384, 256, 100_000.0, 7.6e-5, 0.5), 3.0, (0.8, 1.5))
     assert answer.camera.focus_distance_m == pytest.approx(3.0, rel=0.15)
     assert "where infinity was told" in answer.warnings[0]
 
