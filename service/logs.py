@@ -38,4 +38,8 @@ def _rendered(style: Literal["console", "json"]) -> list[Processor]:
         return [strip, structlog.processors.format_exc_info, structlog.processors.JSONRenderer()]
     terminal = Console(stderr=True)
     colors = terminal.is_terminal and not terminal.no_color
-    return [strip, structlog.dev.ConsoleRenderer(colors=colors, exception_formatter=structlog.dev.plain_traceback)]
+    # quoted: a terminal would do what the control characters in a stranger's words tell it
+    shown = structlog.dev.ConsoleRenderer(
+        colors=colors, repr_native_str=True, exception_formatter=structlog.dev.plain_traceback
+    )
+    return [strip, shown]

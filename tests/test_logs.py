@@ -28,6 +28,13 @@ def test_colours_are_a_terminal_s_where_they_are_wanted(
     assert ("\x1b" in str(render(None, "info", {"event": "asked", "level": "info"}))) == is_coloured
 
 
+def test_what_was_sent_commands_no_terminal() -> None:
+    *_, render = logs._rendered("console")
+    line = str(render(None, "info", {"event": "request", "level": "info", "camera": "\x1b[2J\x9b\u202e\u2028"}))
+    assert line.isprintable()
+    assert r"camera='\x1b[2J\x9b\u202e\u2028'" in line
+
+
 def test_a_warning_of_python_s_is_an_event_too() -> None:
     warning = "import warnings; from service import logs; logs.configure('info', 'json'); warnings.warn('two\\nlines')"
     done = subprocess.run([sys.executable, "-c", warning], capture_output=True, text=True, check=True)
