@@ -146,7 +146,7 @@ class ResultRead(BaseModel):
     curve: Annotated[list[CurvePointRead], Field(description="The fitted blur over the distances measured")]
     corner_ratio: Annotated[
         float | None, Field(description="k_cam in the corners over that in the middle; null where too few circles were")
-    ]
+    ] = None
     f_number: Annotated[
         float | None,
         Field(description="Aperture of the photographs by their EXIF; null where it tells none or several"),

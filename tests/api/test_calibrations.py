@@ -4,7 +4,7 @@ import json
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -13,11 +13,14 @@ import pytest
 from fastapi import FastAPI
 from httpx2 import Response
 from pydantic import JsonValue
+from sqlalchemy import update
 from starlette.testclient import TestClient
 
 from service.app import create_app
 from service.config import Settings
 from service.inference.exif import F_NUMBER
+from service.storage.engine import writing
+from service.storage.tables import CalibrationRow
 from tests.fake_calibration import RESULT, SETTINGS, FakeCalibration, without_calibrations
 from tests.inference.photographs import corners, exif_of, jpeg, png, with_exif
 from tests.simulated_sheets import CAMERA, FEW_DEPTHS_M, GRID, sheet_photos
@@ -526,6 +529,19 @@ def test_what_was_not_registered_is_accepted_later(client: TestClient) -> None:
     # an answer that was lost is asked for again
     assert client.post(f"{path}/accept", json={"camera": "bench"}).json() == accepted.json()
     assert client.get("/cameras/bench").json()["revision"] == 1
+
+
+def test_what_an_older_version_found_is_read_drawn_and_accepted(app: FastAPI, client: TestClient) -> None:
+    path = send(client, prefer="wait=20").headers["location"]
+    found = client.get(path).json()["result"]
+    since = {field.name for field in fields(RESULT) if field.default is not MISSING}
+    assert {"corner_ratio", "f_number"} <= since
+    older = {name: value for name, value in found.items() if name not in since - {"warnings"}}
+    with writing(app.state.engine) as session:
+        session.connection().execute(update(CalibrationRow).values(result=older))
+    assert client.get(path).json()["result"] == {**found, "corner_ratio": None, "f_number": None}
+    assert client.get(f"{path}/plot.svg").status_code == 200
+    assert client.post(f"{path}/accept", json={}).json()["camera_revision"] == 1
 
 
 def test_a_calibration_is_accepted_into_another_camera(client: TestClient, phone: dict[str, Any]) -> None:
