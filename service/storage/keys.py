@@ -109,7 +109,8 @@ class Keys:
         now = datetime.now(UTC)
         if key is None or not key.is_good(now):
             return None
-        if key.last_used_at is None or now - key.last_used_at >= NOTED_EVERY:
+        # a use that a clock since set back noted is not the last one
+        if key.last_used_at is None or abs(now - key.last_used_at) >= NOTED_EVERY:
             # a database that takes no writes is no reason to refuse a reader
             with suppress(CamindError):
                 self._note_use(key.id, now)
