@@ -9,16 +9,18 @@ from typing import Any
 import pytest
 from fastapi import FastAPI
 from httpx2 import Response
-from sqlalchemy import Engine, update
+from sqlalchemy import Engine, select, update
+from sqlmodel import col
 from starlette.testclient import TestClient
 
+from service.api.schemas import CameraCreate
 from service.app import create_app
 from service.config import Settings
 from service.errors import Conflict, KeyReused
 from service.optics.camera import Camera
 from service.storage.calibrations import CalibrationDraft, Calibrations, StoredPicture
 from service.storage.cameras import CameraDraft, Cameras
-from service.storage.idempotency import KEPT, Once
+from service.storage.idempotency import KEPT, Once, once_of
 from service.storage.tables import IdempotencyRow
 from tests.fake_calibration import SETTINGS, FakeCalibration
 from tests.inference.photographs import corners, png
@@ -69,6 +71,14 @@ def test_it_answers_so_whatever_became_of_the_camera(client: TestClient) -> None
     assert client.delete("/cameras/bench").status_code == 204
     assert register(client, "a").json() == first
     assert client.get("/cameras/bench").status_code == 404
+
+
+def test_a_field_that_a_later_version_adds_makes_no_other_request(app: FastAPI, client: TestClient) -> None:
+    assert register(client, "a").status_code == 201
+    sent = {field: CAMERA[field] for field in CameraCreate.model_fields if field in CAMERA}
+    once = once_of("a", [b"POST /cameras", json.dumps(sent, separators=(",", ":")).encode()])
+    with app.state.engine.connect() as connection:
+        assert connection.scalar(select(col(IdempotencyRow.fingerprint))) == (once and once.fingerprint)
 
 
 def test_another_request_with_the_same_key_is_refused(client: TestClient) -> None:
