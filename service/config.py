@@ -71,6 +71,8 @@ class StorageSettings(BaseSettings):
         try:
             url = self.effective_database_url
             url.get_dialect()().create_connect_args(url)
+            if "@" in (url.host or ""):
+                raise ValueError("a password ends at its first @")
         except (ArgumentError, ValueError) as exc:
             # what was read wrongly may be a part of the password
             raise ValueError(
