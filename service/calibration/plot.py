@@ -1,6 +1,7 @@
 """A calibration as a picture: blur against distance, k_cam picture by picture, and what of the frame was covered."""
 
 import io
+from concurrent.futures import ThreadPoolExecutor
 
 import matplotlib as mpl
 import numpy as np
@@ -13,10 +14,16 @@ from service.metres import in_words
 INCHES = (13.0, 4.6)
 BLUE, ORANGE, GREY = "#1f5fa8", "#d9730d", "#8a8a8a"
 LONGEST_NAME = 14
+# one thread draws for all: matplotlib keeps its fonts open for each, and its settings are everybody's
+ARTIST = ThreadPoolExecutor(1, "plot")
 
 
 def as_svg(result: Result) -> bytes:
     """Three plots as one SVG; the same result gives the same bytes."""
+    return ARTIST.submit(_drawn, result).result()
+
+
+def _drawn(result: Result) -> bytes:
     figure = Figure(INCHES, layout="constrained")
     blur, spread, frame = figure.subplots(1, 3)
     _blur(blur, result)

@@ -1,7 +1,10 @@
 """The picture of a calibration, read as a browser draws it: what is lower has the larger y."""
 
 import re
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
+from threading import Barrier
 
 from service.calibration.fit import CurvePoint
 from service.calibration.plot import as_svg
@@ -47,3 +50,17 @@ def test_what_was_left_out_is_told_apart_where_there_is_any() -> None:
 def test_the_frame_is_upright() -> None:
     (places,) = dots(DRAWN, 3)
     assert [y for _, y in places] == sorted(y for _, y in places)
+
+
+def test_threads_draw_the_same_and_open_no_fonts_of_their_own() -> None:
+    alone, together = as_svg(DRAWN), Barrier(8)
+    files = Path("/proc/self/fd")
+    before = len(list(files.iterdir()))
+
+    def drawn(_: int) -> bytes:
+        together.wait()
+        return as_svg(DRAWN)
+
+    with ThreadPoolExecutor(8) as pool:
+        assert set(pool.map(drawn, range(8))) == {alone}
+    assert len(list(files.iterdir())) <= before
