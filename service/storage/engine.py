@@ -55,7 +55,7 @@ def _make_file_private(_dialect: object, _record: object, arguments: Sequence[st
     """
     # SQLite says better why a file cannot be made
     with suppress(OSError):
-        os.close(os.open(arguments[0], os.O_RDONLY | os.O_CREAT | os.O_EXCL, 0o600))
+        os.close(os.open(os.path.realpath(arguments[0]), os.O_RDONLY | os.O_CREAT | os.O_EXCL, 0o600))
 
 
 def _open_postgresql(url: URL) -> Engine:

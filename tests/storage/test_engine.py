@@ -47,6 +47,12 @@ def test_sqlite_is_set_to_keep_what_it_acknowledged(sqlite: Engine) -> None:
         assert str(pragma("journal_mode")).upper() == journal_mode()
 
 
+def test_what_a_link_leads_to_is_made_for_its_owner_alone(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to("a.sqlite3")
+    schema.upgrade(open_engine(f"sqlite:///{tmp_path / 'link'}"))
+    assert (tmp_path / "a.sqlite3").stat().st_mode & 0o777 == 0o600
+
+
 def test_what_is_stored_is_for_its_owner_alone(tmp_path: Path) -> None:
     before = os.umask(0)
     try:
