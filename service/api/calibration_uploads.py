@@ -181,8 +181,6 @@ class _Parts:
         if part.file is None:
             self._take_settings(data[start:end])
             return
-        if len(self._pictures) >= self._limits.max_pictures:
-            raise self._too_many()
         if part.size_bytes > self._limits.max_picture_bytes:
             detail = f"A photograph may have at most {self._limits.max_picture_bytes} bytes."
             raise TooLarge.at(detail, f"#/{part.role}")

@@ -27,7 +27,7 @@ def name_of(cursor: str | None, pattern: str = NAME_PATTERN) -> str | None:
     if cursor is None:
         return None
     try:
-        text = urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)).decode()
+        text = urlsafe_b64decode(cursor + "==").decode()
     except ValueError:
         text = ""
     name = text.removeprefix(PREFIX)

@@ -382,7 +382,6 @@ def _require_row(session: Session, calibration_id: str, owner: str | None, *, lo
 def _changed(session: Session, row: CalibrationRow) -> CalibrationRecord:
     row.version += 1
     row.updated_at = datetime.now(UTC)
-    session.add(row)
     session.flush()
     return _to_record(row)
 

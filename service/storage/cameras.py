@@ -122,8 +122,7 @@ class Cameras:
             return _write_revision(session, row, draft, datetime.now(UTC))
 
     def store_calibrated(self, name: str, camera: Camera) -> CameraRecord:
-        """Make the camera or give it a new revision, as a calibration found it. Raises ``BadRequest`` for no name."""
-        require_name(name)
+        """Make the camera or give it a new revision, as a calibration found it."""
         with writing(self._engine) as session:
             return store_calibrated(session, self._owner, name, camera)
 
@@ -132,7 +131,6 @@ class Cameras:
         with writing(self._engine) as session:
             row = _require_row(session, self._owner, name, expected)
             row.deleted_at = datetime.now(UTC)
-            session.add(row)
 
     def _add(self, draft: CameraDraft, once: Once | None) -> CameraRecord:
         now = datetime.now(UTC)

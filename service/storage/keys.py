@@ -92,8 +92,6 @@ class Keys:
             if row is None:
                 raise NotFound(f"There is no key '{key_id[:64]}': `camind keys list` shows them.")
             row.revoked_at = row.revoked_at or datetime.now(UTC)
-            session.add(row)
-            session.flush()
             return _to_key(row)
 
     def find(self, text: str) -> ApiKey | None:
@@ -127,7 +125,6 @@ class Keys:
             row = session.get(ApiKeyRow, key_id)
             if row is not None:
                 row.last_used_at = now
-                session.add(row)
 
 
 def _digest(secret: str) -> str:
