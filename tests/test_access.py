@@ -159,7 +159,8 @@ def test_every_path_but_health_and_the_page_asks_for_a_key(app: FastAPI, client:
 
 @pytest.mark.parametrize("words", ["", "Bearer", "Bearer x", "Basic eDp5", "Bearer camind_0123456789ab_" + "x" * 43])
 def test_what_is_no_key_lets_nobody_in(client: TestClient, words: str) -> None:
-    refused(client.get("/cameras", headers={"Authorization": words}), 401, "unauthorized")
+    for more in ({}, ASKED_BEFOREHAND):
+        refused(client.get("/cameras", headers={"Authorization": words, **more}), 401, "unauthorized")
 
 
 def test_a_key_opens_what_its_scope_names_and_nothing_else(app: FastAPI, client: TestClient, keys: Keys) -> None:

@@ -1,6 +1,7 @@
 """``POST /calibrate`` and ``/calibrations`` end to end, with a stand-in for the calibration itself."""
 
 import json
+import re
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -409,11 +410,19 @@ def test_what_is_no_form_is_unsupported(client: TestClient, kind: str) -> None:
 
 @pytest.mark.parametrize("kept", [0.2, 0.6, 0.99])
 def test_a_form_that_is_cut_off_is_refused(client: TestClient, spool_dir: Path, kept: float) -> None:
-    whole = client.build_request("POST", "/calibrate?camera=bench", files=[settings_part(), picture()])
+    whole = client.build_request("POST", "/calibrate?camera=bench", files=[settings_part(), picture(), picture()])
     body = whole.read()
     headers = {"Content-Type": whole.headers["content-type"]}
     refused(client.post("/calibrate?camera=bench", content=body[: int(len(body) * kept)], headers=headers), 422)
     assert folders(spool_dir) == []
+
+
+def test_headers_of_a_form_s_parts_come_in_any_order(client: TestClient) -> None:
+    whole = client.build_request("POST", "/calibrate?camera=bench", files=[settings_part(), picture()])
+    turned = re.sub(rb"(Content-Disposition: [^\r]+\r\n)(Content-Type: [^\r]+\r\n)", rb"\2\1", whole.read())
+    assert turned != whole.content
+    headers = {"Content-Type": whole.headers["content-type"]}
+    assert client.post("/calibrate?camera=bench", content=turned, headers=headers).status_code == 202
 
 
 @pytest.mark.parametrize(

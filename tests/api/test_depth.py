@@ -286,6 +286,7 @@ def test_another_focus_distance_moves_k_cam_and_warns_without_a_focal_length(ben
     response = ask(bench, format="npy", focus_distance_m=1.6)
     np.testing.assert_allclose(npy(response), depth_near(LEVEL, 7.5, 0.5, 1.6), rtol=1e-3)
     assert "focal length" in response.headers["Camind-Warnings"]
+    assert ask(bench, focus_distance_m=2.0).headers["Camind-Warnings"] == ""  # where it is anyway
 
 
 def test_a_lens_moves_focus_exactly_but_not_nearer_than_its_focal_length(

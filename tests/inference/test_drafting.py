@@ -41,11 +41,19 @@ def test_tags_are_read_from_a_jpeg_s_exif() -> None:
     assert found.focal_plane_pitch_um == pytest.approx(1e4 / 4164)
 
 
-@pytest.mark.parametrize(("tag", "rendering"), [(0, None), (1, None), (6, "a panorama"), (8, "a portrait mode")])
+RENDERINGS = [(0, None), (1, None), (6, "a panorama"), (7, "a portrait mode"), (8, "a portrait mode")]
+
+
+@pytest.mark.parametrize(("tag", "rendering"), RENDERINGS)
 def test_a_phone_s_rendering_is_read_and_said(tag: int, rendering: str | None) -> None:
     found = read_exif(exif_of(NIKON, SHOT | {RENDERED: tag}))
     assert found.rendering == rendering
     assert said(draft_camera(found, 3872, 2592), "its EXIF says", "take one without") == (rendering is not None)
+
+
+def test_text_is_read_without_control_characters_and_no_more_of_it_than_a_name_has() -> None:
+    found = read_exif(exif_of({MAKE: " Ni\x1bkon\n ", MODEL: "D" * 300}, {LENS: "\x07 "}))
+    assert (found.make, found.model, found.lens) == ("Nikon", "D" * 64, None)
 
 
 @pytest.mark.parametrize("version", [0, 1, 2])

@@ -222,6 +222,16 @@ def test_a_file_that_is_cut_off_is_refused(kind: str, kept: float) -> None:
         read_photograph(data[: int(len(data) * kept)])
 
 
+@pytest.mark.parametrize("layout", [{"rowsperstrip": 16}, {"tile": (16, 16)}])
+def test_a_tiff_whose_directory_comes_first_is_refused_where_its_last_part_is_cut_off(layout: dict[str, Any]) -> None:
+    out = BytesIO()
+    tifffile.imwrite(out, corners(), photometric="rgb", compression="zlib", metadata=None, **layout)
+    data = out.getvalue()
+    assert read_photograph(data).width_px == 64
+    with pytest.raises(InvalidImage, match="ends before the picture"):
+        read_photograph(data[:-1])
+
+
 @pytest.mark.parametrize("kind", MAKERS)
 def test_no_prefix_of_a_file_gets_past_the_door(kind: str) -> None:
     data = MAKERS[kind](corners(16, 16), 6)
@@ -234,6 +244,14 @@ def test_a_file_that_ends_in_zeros_is_refused() -> None:
     data = jpeg(corners())
     with pytest.raises(InvalidImage):
         read_photograph(data[: len(data) // 2] + bytes(len(data) // 2))
+
+
+@pytest.mark.parametrize(("width", "height"), [(0, 48), (64, 0)])
+def test_a_picture_without_pixels_is_no_picture(width: int, height: int) -> None:
+    data = png(corners())
+    header = png_chunk(b"IHDR", struct.pack(">II", width, height) + data[24:29])
+    with pytest.raises(InvalidImage, match=f"{width}x{height}"):
+        read_photograph(data[:8] + header + data[33:])
 
 
 def test_a_damaged_png_is_refused() -> None:

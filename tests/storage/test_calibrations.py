@@ -83,6 +83,16 @@ def test_the_first_to_come_is_the_first_to_run(calibrations: Calibrations) -> No
     assert calibrations.waiting(OTHER_SPOOL).total() == 1
 
 
+def test_owners_take_turns(calibrations: Calibrations, engine: Engine) -> None:
+    owners = {name: Calibrations(engine, name) for name in ("lab", "guest")}
+    owners["lab"].add(draft(OTHER_SPOOL))
+    assert calibrations.take(OTHER_SPOOL) is not None
+    came = [(owner, owners[owner].add(draft()).id) for owner in ("lab", "guest", "guest", "guest", "lab")]
+    assert calibrations.waiting(SPOOL) == {"lab": 2, "guest": 3}
+    taken = [record.id for record in (calibrations.take(SPOOL) for _ in came) if record is not None]
+    assert taken == [came[number][1] for number in (0, 1, 4, 2, 3)]
+
+
 def test_one_of_many_takes_what_waits(calibrations: Calibrations) -> None:
     calibrations.add(draft())
     with ThreadPoolExecutor(4) as pool:
@@ -91,6 +101,7 @@ def test_one_of_many_takes_what_waits(calibrations: Calibrations) -> None:
 
 
 def test_every_change_has_a_version(calibrations: Calibrations) -> None:
+    calibrations.add(draft(OTHER_SPOOL))
     calibration_id = calibrations.add(draft()).id
     versions = [calibrations.version(calibration_id)]
     for change in (
@@ -116,6 +127,7 @@ def test_progress_stays_within_bounds(calibrations: Calibrations, told: float, k
 
 @pytest.mark.parametrize("state", ["succeeded", "failed", "cancelled"])
 def test_what_has_ended_never_changes_again(calibrations: Calibrations, cameras: Cameras, state: EndState) -> None:
+    running_elsewhere(calibrations)
     calibration_id = ended(calibrations, state)
     before = calibrations.get(calibration_id)
     assert before.state == state
@@ -126,6 +138,7 @@ def test_what_has_ended_never_changes_again(calibrations: Calibrations, cameras:
     assert not calibrations.finish(calibration_id, replace(SUCCESS, camera=CAMERA))
     assert calibrations.cancel(calibration_id) == state
     calibrations.recover(SPOOL)
+    calibrations.give_up("c" * 32, timedelta(0))
     assert calibrations.get(calibration_id) == before
     with pytest.raises(NotFound):
         cameras.get("bench")
@@ -133,9 +146,11 @@ def test_what_has_ended_never_changes_again(calibrations: Calibrations, cameras:
 
 def test_what_waits_can_be_cancelled_and_is_not_taken(calibrations: Calibrations) -> None:
     calibration_id = calibrations.add(draft()).id
+    before = calibrations.version(calibration_id)
     assert calibrations.cancel(calibration_id) == "queued"
     assert calibrations.take(SPOOL) is None
     assert calibrations.get(calibration_id).state == "cancelled"
+    assert calibrations.version(calibration_id) > before
 
 
 def test_what_is_put_back_was_not_tried(calibrations: Calibrations) -> None:
@@ -155,6 +170,15 @@ def test_what_a_dead_process_left_is_tried_again(calibrations: Calibrations) -> 
     again = calibrations.take(SPOOL)
     assert again is not None
     assert (again.id, again.attempts) == (calibration_id, 2)
+
+
+def test_what_is_tried_again_changes_nothing_else(calibrations: Calibrations) -> None:
+    others = [ended(calibrations, "succeeded"), running_elsewhere(calibrations).id]
+    before = [calibrations.get(each) for each in others]
+    calibration_id = running(calibrations)
+    calibrations.recover(SPOOL)
+    assert calibrations.get(calibration_id).state == "queued"
+    assert [calibrations.get(each) for each in others] == before
 
 
 def test_what_is_tried_again_begins_anew_and_who_follows_it_is_told(calibrations: Calibrations, engine: Engine) -> None:
@@ -332,6 +356,13 @@ def test_another_owner_s_is_as_if_not_there(calibrations: Calibrations, engine: 
             action()
     assert others.page(9) == ([], False)
     assert calibrations.get(calibration_id).state == "running"
+
+
+def test_what_an_owner_accepts_becomes_that_owner_s_camera(cameras: Cameras, engine: Engine) -> None:
+    lab = Calibrations(engine, "lab")
+    lab.accept(ended(lab, "succeeded"), "bench", CAMERA)
+    assert Cameras(engine, "lab").get("bench").camera == CAMERA
+    assert cameras.page(9) == ([], False)
 
 
 def test_accepted_by_many_at_once_it_is_stored_once(calibrations: Calibrations, engine: Engine) -> None:

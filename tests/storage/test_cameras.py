@@ -67,6 +67,7 @@ def test_revisions_are_read_from_the_newest_down(cameras: Cameras) -> None:
     assert newest[0].created_at > newest[1].created_at
     oldest, has_more = cameras.revisions(DRAFT.name, 2, before=2)
     assert ([one.draft for one in oldest], has_more) == ([DRAFT], False)
+    assert not cameras.revisions(DRAFT.name, 3)[1]
 
 
 def test_a_name_that_is_registered_anew_is_as_old_as_that(cameras: Cameras) -> None:
