@@ -97,6 +97,11 @@ def test_intrinsics_and_description_come_back_as_sent(client: TestClient, phone:
     assert camera["fx_px"] == 3000
 
 
+def test_intrinsics_that_are_sent_count_more_than_the_lens(client: TestClient, d200: dict[str, Any]) -> None:
+    sent = d200 | {"intrinsics": {"fx_px": 980.0, "fy_px": 981.0, "cx_px": 320.0, "cy_px": 214.0}}
+    assert client.post("/cameras", json=sent).json()["fx_px"] == 980.0
+
+
 def test_the_aperture_is_the_lens_s_or_that_of_k_cam_and_told_once(
     client: TestClient, phone: dict[str, Any], d200: dict[str, Any]
 ) -> None:

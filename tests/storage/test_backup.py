@@ -213,6 +213,15 @@ def test_nothing_is_not_backed_up(tmp_path: Path) -> None:
     assert files_of(tmp_path) == set()
 
 
+def test_a_backup_is_one_file_where_the_database_has_a_log_beside_it(database: Path, tmp_path: Path) -> None:
+    target = tmp_path / "copy.sqlite3"
+    with closing(sqlite3.connect(database)) as connection:
+        assert connection.execute("PRAGMA journal_mode = WAL").fetchone() == ("wal",)
+    backup(database, target)
+    with closing(sqlite3.connect(target)) as connection:
+        assert connection.execute("PRAGMA journal_mode").fetchone() == ("delete",)
+
+
 def test_a_backup_is_for_its_owner_s_eyes(database: Path, tmp_path: Path) -> None:
     backup(database, tmp_path / "copy.sqlite3")
     assert (tmp_path / "copy.sqlite3").stat().st_mode & 0o077 == 0
