@@ -79,8 +79,8 @@ TURNS: dict[int, tuple[bool, bool, bool]] = {
 UNTURNS = {orientation: {6: 8, 8: 6}.get(orientation, orientation) for orientation in TURNS}
 # not IMREAD_COLOR_RGB: OpenCV 5.0 leaves a 16-bit TIFF read so uninitialised
 DECODE_FLAGS = cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-# below which metres go wrong: a jpeg's is the least that the model was trained on, and a webp's filter blurs
-LEAST_QUALITY: dict[Kind, int] = {"jpeg": 60, "webp": 76}
+# below which metres go wrong: faint texture is lost, and a webp's filter blurs
+LEAST_QUALITY: dict[Kind, int] = {"jpeg": 75, "webp": 76}
 CLIPPED_LEVEL, CLIPPED_SHARE, CLIPPED_EVERY = 253, 0.25, 4  # of all colours; of the pixels, from where on it is told
 
 

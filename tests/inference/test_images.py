@@ -270,11 +270,11 @@ def test_a_picture_much_of_which_is_white_is_told(level: int, share: float, *, i
     assert [f"{100 * share:.0f} % of it is overexposed" in words for words in warnings] == [True] * is_told
 
 
-@pytest.mark.parametrize(("quality", "is_told"), [(98, False), (60, False), (59, True), (50, True), (30, True)])
-def test_a_jpeg_coarser_than_the_model_learned_of_is_told(quality: int, *, is_told: bool) -> None:
+@pytest.mark.parametrize(("quality", "is_told"), [(98, False), (75, False), (74, True), (60, True), (30, True)])
+def test_a_jpeg_too_coarse_for_metres_is_told(quality: int, *, is_told: bool) -> None:
     data = jpeg(corners(), quality=quality)
     assert read_header(data).quality == pytest.approx(quality, abs=0.3)
-    told = [words for words in read_photograph(data).warnings if f"a jpeg of quality {quality}, below the 60" in words]
+    told = [words for words in read_photograph(data).warnings if f"a jpeg of quality {quality}, below the 75" in words]
     assert len(told) == is_told
     assert len(read_photograph(data).warnings) == is_told
 
