@@ -10,19 +10,6 @@ const KEY = "camind-api-key";
 /** What the window hears when another key is used, or none. */
 export const KEY_CHANGED = "camind:key";
 
-/**
- * @typedef {object} RequestOptions
- * @property {string} [method]
- * @property {Record<string, string>} [headers]
- * @property {?XMLHttpRequestBodyInit} [body]
- * @property {AbortSignal} [signal]
- * @property {boolean} [asks] whether a missing key is asked for; false for what nobody has clicked for
- */
-
-/** @typedef {{pointer: string, detail: string}} FieldProblem */
-
-/** @typedef {(reason: string | null) => Promise<string | null>} KeyAsker */
-
 /** Why a request failed: the service's problem+json, or that it does not answer (status 0). */
 export class Problem extends Error {
 	status = 0;
@@ -173,7 +160,6 @@ export async function request(path, options = {}) {
  *
  * @param {Response} answer
  * @param {"json" | "blob" | "text"} kind
- * @returns {Promise<any>}
  */
 export async function readBody(answer, kind) {
 	try {
@@ -200,7 +186,7 @@ export function readDepthHeaders(headers) {
 	};
 }
 
-/** @param {string} path @param {unknown} body @param {RequestOptions} [options] @returns {Promise<any>} */
+/** @param {string} path @param {unknown} body @param {RequestOptions} [options] */
 export function sendJson(path, body, { method = "POST", headers = {}, ...options } = {}) {
 	const about = { ...headers, "Content-Type": "application/json" };
 	return getJson(path, { ...options, method, headers: about, body: JSON.stringify(body) });
@@ -234,20 +220,7 @@ export async function everyCamera(options) {
 	return found;
 }
 
-/**
- * `onProgress` gets the part sent, 0 to 1, or null where it is unknown; `onReceived` that of the answer.
- *
- * @typedef {RequestOptions & {onProgress?: (fraction: number | null) => void, onReceived?: (fraction: number | null) => void,
- *   responseType?: "" | "blob" | "json"}} UploadOptions
- */
-
-/**
- * Send a body with progress.
- *
- * @param {string} path
- * @param {UploadOptions} [options]
- * @returns {Promise<{status: number, headers: Headers, body: any}>}
- */
+/** Send a body with progress. @param {string} path @param {UploadOptions} [options] */
 export async function upload(path, options = {}) {
 	return withKey(
 		(headers) => sendWithProgress(path, { ...options, headers }),

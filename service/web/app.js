@@ -10,22 +10,6 @@ import { ProblemBox, useProblem } from "./problem_box.js";
 import { StatusView } from "./status.js";
 import { html, render, useCallback, useEffect, useRef, useState } from "./vendor/preact.js";
 
-/** @typedef {"depth" | "cameras" | "calibrate" | "status"} Tab */
-
-/**
- * What every view gets. Views stay mounted when another is in front, so that nothing is lost.
- *
- * @typedef {object} ViewProps
- * @property {boolean} shown whether the view's tab is in front
- * @property {any[] | null} cameras as the API gives them, by name; null before they are there
- * @property {boolean} lacksCameras whether they could not be had
- * @property {?string} camera the name in the address, for the view in front
- * @property {(about?: {stored?: any}) => Promise<void>} reloadCameras `stored` is among them even where that fails
- * @property {(tab: Tab, about?: {camera?: string | null, replaces?: boolean}) => void} go change the tab, and pick the camera
- *   there; the way back leads past an address that is replaced
- * @property {(text: string) => void} announce say it to who cannot see it
- */
-
 /** @type {{tab: Tab, title: string, View: (props: ViewProps) => any}[]} */
 const TABS = [
 	{ tab: "depth", title: "Depth", View: DepthView },

@@ -19,12 +19,10 @@ const FINAL = new Set(["succeeded", "failed", "cancelled"]);
 /** @type {Record<string, string>} */
 const TONES = { succeeded: "good", failed: "bad", running: "warn", queued: "warn" };
 
-/** @typedef {import("./photo_step.js").Photo} Photo */
-
 /** Ask before the page goes: its own, which the cameras' form does not take away. @param {Event} event */
 const stay = (event) => event.preventDefault();
 
-/** @param {import("./app.js").ViewProps} props */
+/** @param {ViewProps} props */
 export function CalibrateView({ shown, cameras, camera, reloadCameras, go, announce }) {
 	const [step, setStep] = useState(0);
 	const [sheet, setSheet] = useState(() => ({ ...SHEET, ...JSON.parse(kept(KEPT) ?? "{}") }));
@@ -200,7 +198,7 @@ export function CalibrateView({ shown, cameras, camera, reloadCameras, go, annou
 	`;
 }
 
-/** @param {{items: any[], open: string | null, onOpen: (id: string) => void}} props */
+/** @param {RecentProps} props */
 function Recent({ items, open, onOpen }) {
 	if (items.length === 0) return null;
 	return html`

@@ -7,8 +7,6 @@ import { save } from "./save.js";
 import { Table } from "./table.js";
 import { html, useEffect, useRef, useState } from "./vendor/preact.js";
 
-/** @typedef {{camera: any, name: string, does: "create" | "update" | "nothing" | "refuse" | "done", words: string, revision: number | null}} Step */
-
 /** @param {any[]} cameras @param {string} name of the file */
 export function exportCameras(cameras, name) {
 	const text = `${JSON.stringify({ cameras: cameras.map(specsOf) }, null, 2)}\n`;

@@ -22,8 +22,6 @@ import { html, useEffect, useRef, useState } from "./vendor/preact.js";
 
 const WAIT_MS = 250;
 
-/** @typedef {import("./camera_specs.js").Fields} Fields */
-
 /** Bring the reader to a heading, which may be out of sight. @param {?HTMLElement} heading */
 export function arriveAt(heading) {
 	heading?.focus({ preventScroll: true });
@@ -31,10 +29,7 @@ export function arriveAt(heading) {
 	if (top < 0 || top > innerHeight / 2) heading?.scrollIntoView();
 }
 
-/**
- * @param {{editing: any | null, onSaved: (words: string, camera: any) => void, onTyped: () => void, onCancel: () => void}} props
- *   `editing` is the camera as it was read, null for a new one
- */
+/** @param {CameraFormProps} props */
 export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 	const [base, setBase] = useState(editing);
 	const [fields, setFields] = useState(/** @type {Fields} */ (editing ? fieldsOf(editing) : BLANK));
@@ -208,10 +203,7 @@ export function CameraForm({ editing, onSaved, onTyped, onCancel }) {
 	`;
 }
 
-/**
- * @param {{path: string, label: string, value: string, form?: string, kind?: string, hint?: string, disabled?: boolean,
- *   faults: import("./api.js").FieldProblem[], onChange: (changed: Fields) => void}} props
- */
+/** @param {FieldProps} props */
 export function Field({ path, label, value, form = "camera", kind = "decimal", hint, disabled = false, faults, onChange }) {
 	const fault = faults.find(({ pointer }) => pointer === `#/${path}` || pointer.startsWith(`#/${path}/`))?.detail;
 	return html`<${TextField}
@@ -220,17 +212,13 @@ export function Field({ path, label, value, form = "camera", kind = "decimal", h
 	/>`;
 }
 
-/** @param {Fields} fields @returns {import("./api.js").FieldProblem[]} */
+/** @param {Fields} fields @returns {FieldProblem[]} */
 function unclear({ "intrinsics/distortion": text = "" }) {
 	const detail = "It is not clear which commas are decimal: put spaces or semicolons between the numbers.";
 	return numbersOf(text) || !text.includes(",") ? [] : [{ pointer: "#/intrinsics/distortion", detail }];
 }
 
-/**
- * What somebody else stored while this was edited, and whose is to stay.
- *
- * @param {{base: any, theirs: any, fields: Fields, onMine: () => void, onTheirs: () => void}} props
- */
+/** What somebody else stored while this was edited, and whose is to stay. @param {ConflictProps} props */
 function Conflict({ base, theirs, fields, onMine, onTheirs }) {
 	const changed = differences(base, theirs);
 	return html`
@@ -259,12 +247,7 @@ function Conflict({ base, theirs, fields, onMine, onTheirs }) {
 	`;
 }
 
-/**
- * The service's answer to the fields, a moment after the last change.
- *
- * @param {Fields} fields
- * @returns {{preview: any | null, faults: import("./api.js").FieldProblem[]}}
- */
+/** The service's answer to the fields, a moment after the last change. @param {Fields} fields */
 function usePreview(fields) {
 	const [seen, setSeen] = useState({ preview: /** @type {any} */ (null), faults: /** @type {any[]} */ ([]) });
 	const { name: _, description: __, ...numbers } = bodyOf(fields);

@@ -2,8 +2,6 @@
 
 import { decimal, short, toMetres } from "./numbers.js";
 
-/** @typedef {Record<string, string>} Fields by the pointer's path: "lens/f_number" */
-
 const SIZE = ["image_width_px", "image_height_px"];
 const LENS = ["focal_length_mm", "f_number", "pixel_pitch_um", "sensor_width_px", "k_r"];
 const K_CAM = ["k_cam_px", "f_number"];
@@ -132,13 +130,7 @@ export function refocusedKCam(fields, held) {
 	return { focusM, kCamPx: Number(((held.k_cam_px * held.focus_distance_m) / focusM).toPrecision(6)) };
 }
 
-/**
- * What differs between two cameras, field by field.
- *
- * @param {any} before
- * @param {any} after
- * @returns {{path: string, before: string, after: string}[]}
- */
+/** What differs between two cameras, field by field. @param {any} before @param {any} after */
 export function differences(before, after) {
 	const [from, to] = [fieldsOf(specsOf(before)), fieldsOf(specsOf(after))];
 	const paths = [...new Set([...Object.keys(from), ...Object.keys(to)])].filter((path) => path !== "by");

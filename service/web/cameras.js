@@ -14,12 +14,10 @@ const A_PAGE = 20;
 /** @type {Record<string, string>} */
 const SOURCES = { given: "given", lens: "from lens specs", calibration: "calibrated" };
 
-/** @typedef {{kind: "none"} | {kind: "read", name: string} | {kind: "new"} | {kind: "edit", camera: any}} Open */
-
 /** Ask before the page goes. @param {Event} event */
 const stay = (event) => event.preventDefault();
 
-/** @param {import("./app.js").ViewProps} props */
+/** @param {ViewProps} props */
 export function CamerasView({ shown, cameras, lacksCameras, camera, reloadCameras, go, announce }) {
 	const [open, setOpen] = useState(/** @type {Open} */ ({ kind: "none" }));
 	const [file, setFile] = useState(/** @type {?File} */ (null));
@@ -162,10 +160,7 @@ export function CamerasView({ shown, cameras, lacksCameras, camera, reloadCamera
 	`;
 }
 
-/**
- * @param {{camera: any, opened: Open, go: import("./app.js").ViewProps["go"], onEdit: () => void, onDeleted: () => void,
- *   onStale: () => void}} props `onStale` is for when the service has another revision
- */
+/** @param {CameraCardProps} props */
 function CameraCard({ camera, opened, go, onEdit, onDeleted, onStale }) {
 	const path = `cameras/${encodeURIComponent(camera.name)}`;
 	const [curve, setCurve] = useState(/** @type {any} */ (null));
@@ -262,7 +257,7 @@ function changesOf(before, after) {
 	return changed.map((one) => `${one.path.replace("/", " ")} ${one.before || "–"} → ${one.after || "–"}`).join("; ");
 }
 
-/** @param {{camera: any, path: string, onClose: () => void, onDeleted: () => void, onStale: () => void}} props */
+/** @param {DeleteDialogProps} props */
 function DeleteDialog({ camera, path, onClose, onDeleted, onStale }) {
 	const dialog = useRef(/** @type {?HTMLDialogElement} */ (null));
 	const [problem, , guard] = useProblem();

@@ -15,19 +15,7 @@ const LETTER = 7; // as wide as one may be
 const MOST_ROWS = 30;
 const TICK_DIGITS = 6; // they are round, and of a narrow range differ in the last ones alone
 
-/** @typedef {{x: number, y: number, low?: number, high?: number, label?: string}} Point */
-
-/**
- * `line` and `dots` draw the points, `band` what is between their `low` and `high`.
- *
- * @typedef {{name: string, kind: "line" | "band" | "dots", tone: string, points: Point[]}} Series
- */
-
-/** @typedef {{label: string, unit: string, from?: number, to?: number, isLog?: boolean}} Axis */
-
-/** @typedef {{scale: (value: number) => number, ticks: number[]}} Scale */
-
-/** @param {{title: string, x: Axis, y: Axis, series: Series[], marks?: {x: number, label: string}[]}} props `marks` are upright lines with a word */
+/** @param {ChartProps} props */
 export function Chart({ title, x, y, series, marks = [] }) {
 	const [box, width] = useWidth(480);
 	const right = width - RIGHT;

@@ -27,8 +27,6 @@ const START = { yaw: 0.22, pitch: -0.14, zoom: 1 };
 const STEEPEST = Math.PI / 2;
 const ZOOMS = [0.05, 20];
 
-/** @typedef {{positions: Float32Array, colours: Uint8Array, centre: number[], spacing: number}} Points */
-
 export class Cloud {
 	/**
 	 * @param {OffscreenCanvas} canvas

@@ -3,9 +3,6 @@
 import { Switch } from "./colour_controls.js";
 import { html, useEffect, useRef, useState } from "./vendor/preact.js";
 
-/** @typedef {import("./cloud_worker.js").Order} Order */
-/** @typedef {(order: Order, parts?: Transferable[]) => void} Tell */
-
 const MOST_POINTS = 300_000;
 const ZOOM = 1.25;
 const TURN = 0.05;
@@ -23,15 +20,7 @@ const KEYS = {
 	Home: ["reset"],
 };
 
-/**
- * @param {{
- *   reader: import("./reader.js").DepthReader,
- *   result: import("./depth.js").Result,
- *   look: import("./maps.js").Look,
- *   hasPhotograph: boolean,
- *   isShown: boolean,
- * }} props
- */
+/** @param {CloudViewProps} props */
 export function CloudView({ reader, result, look, hasPhotograph, isShown }) {
 	const canvas = useRef(/** @type {?HTMLCanvasElement} */ (null));
 	const [tell, setTell] = useState(/** @type {{to: Tell} | null} */ (null));

@@ -2,12 +2,6 @@
 
 import { Cloud } from "./cloud.js";
 
-/**
- * One of the cloud's methods, and what it takes.
- *
- * @typedef {["show", import("./cloud.js").Points] | ["resize" | "orbit", number, number] | ["zoom", number] | ["reset"]} Order
- */
-
 const scope = /** @type {Worker} */ (/** @type {unknown} */ (globalThis));
 /** @type {?Cloud} */
 let cloud = null;

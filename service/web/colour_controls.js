@@ -5,12 +5,10 @@ import { inMetres, toMetres } from "./numbers.js";
 import { Choice } from "./text_field.js";
 import { html, useState } from "./vendor/preact.js";
 
-/** @typedef {import("./maps.js").Look} Look */
-
 const STEPS = 1000;
 const LEAST_RATIO = 1.01;
 
-/** @param {{look: Look, facts: import("./maps.js").Facts, onLook: (look: Look) => void}} props */
+/** @param {{look: Look, facts: Facts, onLook: (look: Look) => void}} props */
 export function Colours({ look, facts, onLook }) {
 	const { spread, validShare, eitherShare } = facts;
 	const change = (/** @type {Partial<Look>} */ part) => onLook({ ...look, ...part });
@@ -35,7 +33,7 @@ export function Colours({ look, facts, onLook }) {
 	</section>`;
 }
 
-/** @param {{title: string, value: number, leastM: number, mostM: number, onValue: (value: number) => void}} props */
+/** @param {BoundProps} props */
 function Bound({ title, value, leastM, mostM, onValue }) {
 	// what is being typed stays, whatever is drawn anew meanwhile
 	const [typed, setTyped] = useState(/** @type {?string} */ (null));
@@ -67,7 +65,7 @@ function Bound({ title, value, leastM, mostM, onValue }) {
 	</div>`;
 }
 
-/** @param {{title: string, isOn: boolean, onSwitch: (isOn: boolean) => void}} props */
+/** @param {SwitchProps} props */
 export function Switch({ title, isOn, onSwitch }) {
 	return html`<label class="choice">
 		<input type="checkbox" checked=${isOn} onChange=${(event) => onSwitch(event.target.checked)} />

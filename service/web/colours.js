@@ -1,7 +1,5 @@
 /** Colour maps as tables of 256 colours, from a few stops each. Near is the end of a table, far its beginning. */
 
-/** @typedef {"cividis" | "viridis" | "turbo" | "grey"} MapName */
-
 // matplotlib's maps (CC0) at even steps; what lies between is off by 7 of 255 at most
 const STOPS = {
 	cividis: "00224e00285b002e6a0433711a386f273e6e32436d3b496c434e6c4b546c52596d5a5f6e61656f686a716f70737576767c7b788481798b8778938d789b9376a39a75aba072b3a670bbad6cc3b469ccba64d4c15fddc958e6d051efd748f8df3cfee838",

@@ -1,14 +1,5 @@
 /** The request behind a picture, as something to paste. */
 
-/**
- * @typedef {object} Ask
- * @property {string} camera
- * @property {string} side
- * @property {?number} focusM
- * @property {import("./tape.js").KnownDepth[]} known
- * @property {string} format
- */
-
 export const FORMATS = {
 	png: "PNG, 16-bit millimetres",
 	npy: "NumPy, metres",
@@ -33,8 +24,6 @@ export function depthPath({ camera, side, focusM, known, format }) {
 export function answerName(photograph, format) {
 	return `${photograph.replace(/\.[^.]*$/, "") || "photograph"}-depth.${format === "preview" ? "jpg" : format}`;
 }
-
-/** @typedef {{url: string, photograph: string, mediaType: string, answer: string, hasKey: boolean}} Command */
 
 /** @param {Command} command the key itself is never in it, but the shell's variable for it */
 export function curlCommand({ url, photograph, mediaType, answer, hasKey }) {

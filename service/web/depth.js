@@ -19,24 +19,6 @@ import { Tape } from "./tape.js";
 import { Choice, TextField } from "./text_field.js";
 import { html, useCallback, useEffect, useMemo, useRef, useState } from "./vendor/preact.js";
 
-/** @typedef {{u: number, v: number}} Pixel */
-/** @typedef {import("./tape.js").KnownDepth} KnownDepth */
-
-/**
- * @typedef {object} Result
- * @property {{camera: string, side: string, focusM: number | null, known: KnownDepth[]}} asked
- * @property {File} file
- * @property {import("./maps.js").Facts} facts
- * @property {number} focusM the focus distance that was used
- * @property {number} revision of the camera
- * @property {string[]} warnings
- * @property {[string, number][]} timings the service's stages in milliseconds
- * @property {string} model
- */
-
-/** @typedef {{distanceM: number, sigmaM: number} | false} Measured false where it is not known */
-/** @typedef {{step: "upload" | "receive", fraction: number | null} | {step: "work", since: number} | {step: "draw"}} Phase */
-
 const SIDES = [
 	["auto", "Let the model decide"],
 	["near", "Nearer than focus"],
@@ -53,10 +35,10 @@ const MANY = 10; // cameras are searched
 const SETTLED_MS = 300;
 const NOT_THE_FRAME = "urn:camind:problem:image-size-mismatch";
 const NO_PHOTOGRAPH = /:(invalid-image|unsupported-kind|too-large)$/;
-/** @type {import("./maps.js").Look} */
+/** @type {Look} */
 const FIRST_LOOK = { map: "cividis", nearM: 1, farM: 2, hatchesNothing: true, dotsEither: true };
 
-/** @param {import("./app.js").ViewProps} props */
+/** @param {ViewProps} props */
 export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloadCameras, go, announce }) {
 	const reader = useMemo(() => new DepthReader(), []);
 	const [file, setFile] = useState(/** @type {?File} */ (null));
@@ -79,7 +61,7 @@ export function DepthView({ shown, cameras, lacksCameras, camera: brought, reloa
 	const [result, setResult] = useState(/** @type {?Result} */ (null));
 	const [look, setLook] = useState(FIRST_LOOK);
 	const [isOpening, setIsOpening] = useState(false);
-	const [reading, setReading] = useState(/** @type {?import("./maps.js").Reading} */ (null));
+	const [reading, setReading] = useState(/** @type {?Reading} */ (null));
 	const [marks, setMarks] = useState(/** @type {Pixel[]} */ ([]));
 	const [picture, setPicture] = useState("photograph");
 	const [counts, setCounts] = useState(/** @type {Uint32Array | null} */ (null));

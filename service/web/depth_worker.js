@@ -40,7 +40,7 @@ const WORK = {
 		return { bitmap: canvas.transferToImageBitmap(), width, height };
 	},
 
-	/** @param {{look: import("./maps.js").Look, width: number, height: number}} about */
+	/** @param {{look: Look, width: number, height: number}} about */
 	async paint({ look, width, height }) {
 		const { pixels, counts } = loaded().paint(look, width, height);
 		const canvas = new OffscreenCanvas(width, height);
@@ -58,7 +58,7 @@ const WORK = {
 		return loaded().distance(from, to);
 	},
 
-	/** @param {{most: number, look: import("./maps.js").Look, isPhotograph: boolean}} about */
+	/** @param {{most: number, look: Look, isPhotograph: boolean}} about */
 	async cloud({ most, look, isPhotograph }) {
 		return loaded().cloud(most, look, isPhotograph ? photograph : null);
 	},

@@ -16,11 +16,10 @@ const NUMBERS = [
 	["lens/sensor_width_px", "Sensor width (px)", SENSOR_WIDTH],
 ];
 
-/** @param {{file: File, onStored: (camera: any) => Promise<void>,
- *   onFailed: (why: import("./api.js").Problem) => void}} props */
+/** @param {DraftFormProps} props */
 export function DraftForm({ file, onStored, onFailed }) {
 	const [draft, setDraft] = useState(/** @type {any} */ (null));
-	const [fields, setFields] = useState(/** @type {import("./camera_specs.js").Fields} */ ({}));
+	const [fields, setFields] = useState(/** @type {Fields} */ ({}));
 	const [problem, setProblem, guard] = useProblem();
 	const [isStoring, setIsStoring] = useState(false);
 	const [attempt, setAttempt] = useState(0);

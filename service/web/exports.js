@@ -8,7 +8,7 @@ import { save } from "./save.js";
 import { Choice } from "./text_field.js";
 import { html, useState } from "./vendor/preact.js";
 
-/** @param {{result: import("./depth.js").Result, announce: (text: string) => void, onChanged: () => void}} props */
+/** @param {ExportsProps} props */
 export function Exports({ result: { asked, file, revision, model, warnings }, announce, onChanged }) {
 	const [format, setFormat] = useState("png");
 	const [isBusy, setIsBusy] = useState(false);

@@ -23,7 +23,7 @@ export function FileButton({ of, onFiles, children, ...button }) {
 	`;
 }
 
-/** @param {{kind?: string, onFiles?: (files: File[]) => void, children?: any}} props */
+/** @param {DropPlaceProps} props */
 export function DropPlace({ kind = "", onFiles, children }) {
 	const [isOver, setIsOver] = useState(false);
 	return html`<div

@@ -3,18 +3,6 @@
 import { short } from "./numbers.js";
 import { upright } from "./photograph_files.js";
 
-/**
- * @typedef {object} Seen a photograph in which the grid was found
- * @property {"focused" | "defocused"} role
- * @property {number} width before EXIF orientation
- * @property {number} height
- * @property {number} orientation of EXIF
- * @property {{u_px: number, v_px: number, radius_px: number}[]} circles
- * @property {?number} blur in px
- * @property {?number} distance in metres
- * @property {?number} tilt in degrees
- */
-
 export const WANTED = 8;
 const COLUMNS = 6;
 const ROWS = 4;
@@ -25,7 +13,6 @@ const SIDE = 1.12; // times the focus distance: nearer than 1/1.12 and farther t
 const BLURRED_PX = 1.5;
 const BLUR_RATIO = 2;
 const MOST_BLUR = 1 / 3; // of a circle's radius: in more the grid is hard to find
-/** @typedef {[number, number]} Between */
 /** @type {Between} */
 const NEARER = [0.6, 0.8];
 /** @type {Between} */
@@ -62,7 +49,7 @@ export function focusOf(seen, told) {
 	return known[0]?.distance ?? null;
 }
 
-/** @param {Seen[]} seen @param {?number} toldFocus in metres @returns {string} */
+/** @param {Seen[]} seen @param {?number} toldFocus in metres */
 export function adviceFor(seen, toldFocus) {
 	const left = WANTED - seen.length;
 	const tilted = seen.filter(({ tilt }) => tilt !== null && tilt >= TILTED_DEG).length;

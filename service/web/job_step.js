@@ -57,10 +57,7 @@ function Images({ images }) {
 	`;
 }
 
-/**
- * @param {{job: any, cameras: any[] | null, onAccepted: (job: any) => void, onDiscard: () => void,
- *   onAgain: () => void, go: import("./app.js").ViewProps["go"]}} props
- */
+/** @param {EndedProps} props */
 export function Ended({ job, cameras, onAccepted, onDiscard, onAgain, go }) {
 	if (job.result === null) {
 		return html`
@@ -124,7 +121,7 @@ export function Ended({ job, cameras, onAccepted, onDiscard, onAgain, go }) {
 	`;
 }
 
-/** @param {{name: string, unit: string, of: {value: number, low: number, high: number}}} props */
+/** @param {ConstantProps} props */
 function Constant({ name, unit, of: { value, low, high } }) {
 	const words = low === high ? "as given" : `${short(low, 4)} to ${short(high, 4)} at 95 %`;
 	return html`<div>
@@ -137,9 +134,7 @@ function Constant({ name, unit, of: { value, low, high } }) {
 /** @param {any} sample */
 const told = (sample) => `${sample.image}, circle ${sample.circle}`;
 
-/** @typedef {{samples: any[], curve: any[], focus_distance_m: any}} Result */
-
-/** @param {{result: Result}} props */
+/** @param {{result: Fit}} props */
 function Fit({ result: { samples, curve, focus_distance_m: focus } }) {
 	const dots = (/** @type {boolean} */ used) =>
 		thinned(samples.filter((sample) => sample.used === used), MOST_DOTS).map((sample) => ({
@@ -162,7 +157,7 @@ function Fit({ result: { samples, curve, focus_distance_m: focus } }) {
 	/>`;
 }
 
-/** @param {{result: Result}} props */
+/** @param {{result: Fit}} props */
 function Residuals({ result: { samples, curve } }) {
 	const used = thinned(samples.filter((sample) => sample.used), MOST_DOTS);
 	const points = used.flatMap((sample) => {
@@ -178,7 +173,7 @@ function Residuals({ result: { samples, curve } }) {
 	/>`;
 }
 
-/** The service's curve between two of its points. @param {any[]} curve @param {number} depth @returns {?number} */
+/** The service's curve between two of its points. @param {any[]} curve @param {number} depth */
 function curveAt(curve, depth) {
 	const after = curve.findIndex(({ depth_m: at }) => at >= depth);
 	if (after < 1) return null;

@@ -3,8 +3,6 @@
 import { setKeyAsker } from "./api.js";
 import { html, useEffect, useRef, useState } from "./vendor/preact.js";
 
-/** @typedef {{reason: string | null, answer: (key: string | null) => void}} Question */
-
 export function KeyDialog() {
 	const [question, setQuestion] = useState(/** @type {?Question} */ (null));
 	const [fault, setFault] = useState(/** @type {?string} */ (null));

@@ -5,7 +5,7 @@ import { inMetres, short } from "./numbers.js";
 import { logTicks, ticksOf } from "./ticks.js";
 import { html, useEffect, useRef } from "./vendor/preact.js";
 
-/** @param {{look: import("./maps.js").Look, counts: Uint32Array | null}} props */
+/** @param {{look: Look, counts: Uint32Array | null}} props */
 export function Legend({ look, counts }) {
 	const { map, nearM, farM, hatchesNothing, dotsEither } = look;
 	const bar = useRef(/** @type {?HTMLCanvasElement} */ (null));

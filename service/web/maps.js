@@ -3,40 +3,6 @@
 import { colourTable, placeOf } from "./colours.js";
 import { readNpz } from "./npy.js";
 
-/**
- * What is known at a pixel; null where there is no answer, or no other hypothesis.
- *
- * @typedef {object} Reading
- * @property {number} u
- * @property {number} v
- * @property {?number} depthM
- * @property {?number} otherM the depth on the other side of the plane in focus
- * @property {?number} sigmaM
- * @property {number} pNear
- * @property {number} blurPx
- * @property {?number} rayLength metres straight from the lens per metre of depth along its axis; null where the
- *   camera's focal length is not known, or no ray meets the pixel
- */
-
-/**
- * @typedef {object} Facts
- * @property {number} width of the photograph, in whose pixels places are told
- * @property {number} height
- * @property {boolean} hasPoints whether the camera's focal length is known, without which a pixel has no direction
- * @property {number} validShare
- * @property {number} eitherShare the part of the pixels that could be on either side
- * @property {{leastM: number, nearM: number, farM: number, mostM: number} | null} spread least, 2 %, 98 % and greatest
- */
-
-/**
- * @typedef {object} Look
- * @property {import("./colours.js").MapName} map
- * @property {number} nearM
- * @property {number} farM
- * @property {boolean} hatchesNothing whether pixels without an answer are hatched
- * @property {boolean} dotsEither whether pixels that could be on either side are dotted
- */
-
 const SAMPLES = 200_000;
 const BINS = 64;
 const LEAST_RATIO = 1.02;
@@ -54,7 +20,7 @@ const MOST_OFF_PX = 0.5;
 
 export class DepthMaps {
 	/**
-	 * @param {Map<string, import("./npy.js").NumpyArray>} arrays
+	 * @param {Map<string, NumpyArray>} arrays
 	 * @param {{image_width_px?: number, image_height_px?: number}} [about] the photograph, if it is larger than its maps
 	 */
 	constructor(arrays, about = {}) {
@@ -227,7 +193,7 @@ export class DepthMaps {
 	 * @param {number} most
 	 * @param {Look} look
 	 * @param {?ImageData} photograph whose colours the points get; null: those of their depths
-	 * @returns {{positions: Float32Array, colours: Uint8Array, centre: number[], spacing: number}} `spacing` is that of
+	 * @returns {Points} `spacing` is that of
 	 *   neighbours at 1 m
 	 */
 	cloud(most, look, photograph) {

@@ -1,7 +1,5 @@
 /** Reads NumPy's npz: a zip of npy files, stored and not compressed. */
 
-/** @typedef {{data: Float32Array | Float64Array | Uint8Array, shape: number[]}} NumpyArray */
-
 const END_OF_DIRECTORY = 0x06054b50;
 const END_BYTES = 22;
 const DIRECTORY_ENTRY_BYTES = 46;

@@ -11,14 +11,6 @@ import { html, useEffect, useRef, useState } from "./vendor/preact.js";
 const THUMB_PX = 320;
 const EXPOSURES = { good: "good", over: "too bright", under: "too dark" };
 
-/** @typedef {"focused" | "defocused"} Role */
-
-/**
- * `asked` is what the look, or the problem, answers: another pattern or camera asks anew.
- *
- * @typedef {{id: number, file: File, role: Role, asked: string, look: any | null, problem: Problem | null}} Photo
- */
-
 /** @type {{role: Role, title: string, words: string}[]} */
 const ROLES = [
 	{
@@ -60,7 +52,7 @@ export function useLooks(photos, setPhotos, query) {
 	}, [next?.id, query]);
 }
 
-/** @param {File} file @param {string} query @param {boolean} asks @param {AbortSignal} signal @returns {Promise<any>} */
+/** @param {File} file @param {string} query @param {boolean} asks @param {AbortSignal} signal */
 async function lookAt(file, query, asks, signal) {
 	for (;;) {
 		try {
@@ -74,10 +66,7 @@ async function lookAt(file, query, asks, signal) {
 	}
 }
 
-/**
- * @param {{photos: Photo[], query: string, focus: number | null,
- *   onChange: (change: (before: Photo[]) => Photo[]) => void, announce: (text: string) => void}} props
- */
+/** @param {PhotographsProps} props */
 export function Photographs({ photos, query, focus, onChange, announce }) {
 	const waiting = photos.filter(({ asked }) => asked !== query).length;
 	const seen = photos.filter(({ look }) => look?.found).map(seenOf);
@@ -144,7 +133,7 @@ export function Photographs({ photos, query, focus, onChange, announce }) {
 	`;
 }
 
-/** @param {Photo} photo that is found @returns {import("./guidance.js").Seen} */
+/** @param {Photo} photo that is found @returns {Seen} */
 function seenOf({ role, look }) {
 	const { width_px: width, height_px: height, orientation, circles, blur_px: blur, distance_m: distance, tilt_deg: tilt } = look;
 	return { role, width, height, orientation, circles, blur, distance, tilt };
@@ -156,7 +145,7 @@ function hasPartner(photo, photos) {
 	return place >= 0 && Boolean(photos.filter(({ role }) => role === "focused")[place]?.look?.found);
 }
 
-/** @param {{photo: Photo, isLooking: boolean, hasPartner: boolean, onRole: (role: Role) => void, onAgain: () => void, onRemove: () => void}} props */
+/** @param {PhotoCardProps} props */
 function PhotoCard({ photo, isLooking, hasPartner: partner, onRole, onAgain, onRemove }) {
 	const { file, look, problem, role } = photo;
 	const [tone, words] = statusOf(photo, isLooking);
@@ -194,7 +183,7 @@ function PhotoCard({ photo, isLooking, hasPartner: partner, onRole, onAgain, onR
 	`;
 }
 
-/** @param {Photo} photo @param {boolean} isLooking @returns {[string, string]} */
+/** @param {Photo} photo @param {boolean} isLooking */
 function statusOf({ look, problem }, isLooking) {
 	if (isLooking) return ["", "looking ..."];
 	if (problem) return ["bad", [413, 415, 422].includes(problem.status) ? "not readable" : "not looked at"];
@@ -254,7 +243,7 @@ function draw(canvas, bitmap, look) {
 	}
 }
 
-/** @param {{seen: import("./guidance.js").Seen[]}} props */
+/** @param {{seen: Seen[]}} props */
 function Coverage({ seen }) {
 	const cells = coverageOf(seen);
 	const all = cells.flat();
@@ -282,7 +271,7 @@ function Coverage({ seen }) {
 	`;
 }
 
-/** @param {{seen: import("./guidance.js").Seen[], focus: number | null}} props */
+/** @param {{seen: Seen[], focus: number | null}} props */
 function Distances({ seen, focus }) {
 	const points = seen.flatMap(({ distance: x, blur: y }) => (x === null || y === null ? [] : [{ x, y }]));
 	return html`

@@ -3,10 +3,7 @@
 import { problemOf } from "./api.js";
 import { html, useEffect, useState } from "./vendor/preact.js";
 
-/**
- * @param {{problem: import("./api.js").Problem | null, onRetry?: () => void, onClose?: () => void}} props
- *   renders nothing where there is no problem, and offers `onRetry` only where that may help
- */
+/** @param {ProblemBoxProps} props */
 export function ProblemBox({ problem, onRetry, onClose }) {
 	const waitS = useCountdown(problem);
 	if (problem === null) return null;
@@ -41,12 +38,12 @@ export function Warnings({ texts }) {
 
 /** The problem there is, how it is set, and a guard for work that may meet one. */
 export function useProblem() {
-	const [problem, setProblem] = useState(/** @type {?import("./api.js").Problem} */ (null));
+	const [problem, setProblem] = useState(/** @type {?Problem} */ (null));
 	const guard = (/** @type {() => Promise<unknown>} */ work) => work().catch((error) => setProblem(problemOf(error)));
 	return /** @type {const} */ ([problem, setProblem, guard]);
 }
 
-/** @param {?import("./api.js").Problem} problem whose wait is counted down, in seconds */
+/** @param {?Problem} problem whose wait is counted down, in seconds */
 function useCountdown(problem) {
 	const [waitS, setWaitS] = useState(0);
 	useEffect(() => {

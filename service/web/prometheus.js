@@ -1,8 +1,6 @@
 /** What the service counts about itself, read from Prometheus' text format. */
 
-/** @typedef {{name: string, labels: Record<string, string>, value: number}} Sample */
-
-/** @param {string} text @returns {Sample[]} */
+/** @param {string} text */
 export function readSamples(text) {
 	return [...text.matchAll(/^(\w+)(?:\{(.*)\})? (\S+)$/gm)].map(([, name, labels = "", value]) => ({
 		name,

@@ -3,8 +3,6 @@
 import { inMetres } from "./numbers.js";
 import { html } from "./vendor/preact.js";
 
-/** @typedef {import("./maps.js").Reading} Reading */
-
 /** @param {{reading: Reading | null, focusM: number}} props */
 export function Readout({ reading, focusM }) {
 	return html`<section class="card stack depth-readout" aria-label="Under the pointer">
@@ -41,14 +39,7 @@ export function Readout({ reading, focusM }) {
 	</section>`;
 }
 
-/**
- * @param {{
- *   marks: import("./depth.js").Pixel[],
- *   measured: import("./depth.js").Measured | null,
- *   hasPoints: boolean,
- *   onClear: () => void,
- * }} props
- */
+/** @param {DistanceProps} props */
 export function Distance({ marks, measured, hasPoints, onClear }) {
 	const says = () => {
 		if (!hasPoints) return "Needs the camera's focal length: give the camera its lens or its intrinsics.";

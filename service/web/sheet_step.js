@@ -18,12 +18,6 @@ const GRIDS = [
 	["symmetric_circles", "in line"],
 ];
 
-/**
- * The sheet as it is printed, numbers as they are typed; `ruler_mm` is what the printed ruler of 100 mm measures.
- *
- * @typedef {{kind: string, rows: string, columns: string, spacing_mm: string, diameter_mm: string, paper: string, ruler_mm: string}} Sheet
- */
-
 /** @type {Sheet} */
 export const SHEET = {
 	kind: "asymmetric_circles",
@@ -35,12 +29,7 @@ export const SHEET = {
 	ruler_mm: "100",
 };
 
-/**
- * The pattern as it came out of the printer.
- *
- * @param {Sheet} sheet
- * @returns {{kind: string, rows: number, columns: number, spacing_mm: number, diameter_mm: number}}
- */
+/** The pattern as it came out of the printer. @param {Sheet} sheet */
 export function patternOf({ kind, rows, columns, spacing_mm, diameter_mm, ruler_mm }) {
 	const scale = decimal(ruler_mm) / RULER_MM;
 	const printed = (/** @type {string} */ length) => Number((decimal(length) * scale).toPrecision(6));
@@ -58,7 +47,7 @@ export function isMeasured({ ruler_mm }) {
 	return decimal(ruler_mm) >= 50 && decimal(ruler_mm) <= 200;
 }
 
-/** @param {{sheet: Sheet, onChange: (sheet: Sheet) => void, onNext: () => void}} props */
+/** @param {SheetStepProps} props */
 export function SheetStep({ sheet, onChange, onNext }) {
 	const { picture, problem } = usePicture(sheet);
 	const [failed, setFailed, guard] = useProblem();
@@ -139,7 +128,7 @@ function queryOf({ ruler_mm: _, ...asked }) {
 	return new URLSearchParams(Object.entries(asked).map(([name, text]) => [name, text.replace(",", ".")]));
 }
 
-/** @param {Sheet} sheet @returns {{picture: string | null, problem: Problem | null}} */
+/** @param {Sheet} sheet */
 function usePicture(sheet) {
 	const [state, setState] = useState({ picture: /** @type {?string} */ (null), problem: /** @type {?Problem} */ (null) });
 	const query = String(queryOf(sheet));

@@ -6,9 +6,6 @@ import { sideOf } from "./readout.js";
 import { html, useEffect, useMemo, useRef, useState } from "./vendor/preact.js";
 import { useWidth } from "./width.js";
 
-/** @typedef {import("./depth.js").Pixel} Pixel */
-/** @typedef {import("./maps.js").Reading} Reading */
-
 const MOST_PX = 2000;
 const DIVIDER_REACH_PX = 14;
 const CLICK_PX = 3; // what moves less is no drag
@@ -16,23 +13,7 @@ const LARGE_STEPS = 20;
 const STILL_MS = 500;
 const HINT = "depth-stage-hint";
 
-/**
- * @param {{
- *   reader: import("./reader.js").DepthReader,
- *   size: {width: number, height: number},
- *   look: import("./maps.js").Look,
- *   bitmap: ImageBitmap | null,
- *   result: import("./depth.js").Result | null,
- *   reading: Reading | null,
- *   marks: Pixel[],
- *   measured: import("./depth.js").Measured | null,
- *   known: import("./tape.js").KnownDepth[],
- *   onReading: (reading: Reading | null) => void,
- *   onMarks: (marks: Pixel[]) => void,
- *   onCounts: (counts: Uint32Array) => void,
- *   announce: (text: string) => void,
- * }} props
- */
+/** @param {StageProps} props */
 export function Stage({
 	reader, size, look, bitmap, result, reading, marks, measured, known, onReading, onMarks, onCounts, announce,
 }) {
@@ -252,7 +233,7 @@ function Marks({ size, reading, marks, measured, known }) {
 	`;
 }
 
-/** Words above or below a place, as far to its left as keeps them inside the picture. @param {{left: number, top: number, isBelow: boolean, name: string, children?: any}} props */
+/** Words above or below a place, as far to its left as keeps them inside the picture. @param {LabelProps} props */
 function Label({ left, top, isBelow, name, children }) {
 	const across = `${-100 * left}%`;
 	const down = isBelow ? "10px" : "calc(-100% - 10px)";

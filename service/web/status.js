@@ -7,19 +7,6 @@ import { save } from "./save.js";
 import { Table } from "./table.js";
 import { html, useEffect, useState } from "./vendor/preact.js";
 
-/** @typedef {import("./prometheus.js").Sample} Sample */
-
-/**
- * What one look found: a problem in the place of what could not be had, null where nobody has looked yet.
- *
- * @typedef {object} Found
- * @property {any | Problem | null} ready
- * @property {any | Problem | null} model
- * @property {Sample[] | Problem | null} samples
- * @property {?string} key it looked with
- * @property {?Date} at
- */
-
 /** @type {Found} */
 const NOTHING = { ready: null, model: null, samples: null, key: null, at: null };
 const LOOK_EVERY_MS = 5000;
@@ -46,7 +33,7 @@ const RANGES = {
 	depth_ratio: "Depth, of focus distance",
 };
 
-/** @param {import("./app.js").ViewProps} props */
+/** @param {ViewProps} props */
 export function StatusView({ shown, announce }) {
 	const [found, setFound] = useState(NOTHING);
 	const [round, setRound] = useState(0);
@@ -171,7 +158,7 @@ function Documents({ wantsKey }) {
 	`;
 }
 
-/** @param {{title: string, samples: Sample[] | Problem | null, Content: (props: {samples: Sample[]}) => any}} props */
+/** @param {FiguresProps} props */
 function Figures({ title, samples, Content }) {
 	return html`
 		<section class="card" aria-label=${title}>

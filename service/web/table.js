@@ -2,7 +2,7 @@
 
 import { html } from "./vendor/preact.js";
 
-/** @param {{label: string, head: string[], numbers?: number[], children?: any}} props `numbers` are columns of numbers */
+/** @param {TableProps} props */
 export function Table({ label, head, numbers = [], children }) {
 	return html`<div class="table-scroll" tabindex="0" role="region" aria-label=${label}>
 		<table>

@@ -4,8 +4,6 @@ import { decimal, inMetres } from "./numbers.js";
 import { Choice, TextField } from "./text_field.js";
 import { html, useState } from "./vendor/preact.js";
 
-/** @typedef {{u: number, v: number, depthM: number}} KnownDepth */
-
 const WAYS = [
 	["axis", "Along the lens' axis"],
 	["straight", "Straight from the lens"],
@@ -14,15 +12,7 @@ const WAYS = [
 const NEAREST_M = 0.001;
 const FARTHEST_M = 99_999;
 
-/**
- * @param {{
- *   reader: import("./reader.js").DepthReader,
- *   mark: import("./depth.js").Pixel | null,
- *   hasPoints: boolean,
- *   known: KnownDepth[],
- *   onKnown: (known: KnownDepth[]) => void,
- * }} props
- */
+/** @param {TapeProps} props */
 export function Tape({ reader, mark, hasPoints, known, onKnown }) {
 	const [text, setText] = useState("");
 	const [fault, setFault] = useState("");

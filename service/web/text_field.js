@@ -2,11 +2,7 @@
 
 import { html } from "./vendor/preact.js";
 
-/**
- * @param {{id: string, label: string, value: string, onInput: (value: string) => void, fault?: string, hint?: any,
- *   onChange?: (value: string) => void, kind?: string, list?: string, disabled?: boolean, invalid?: boolean, role?: string | null}} props
- *   `onChange` is for when the typing is over; a fault has the `role`
- */
+/** @param {TextFieldProps} props */
 export function TextField({ id, label, value, onInput, fault = "", hint, onChange, kind, list, disabled = false, invalid = fault !== "", role = "alert" }) {
 	return html`
 		<div class="field">
@@ -27,7 +23,7 @@ export function TextField({ id, label, value, onInput, fault = "", hint, onChang
 	`;
 }
 
-/** @param {{label: string, value: string, options: string[][], onChange: (value: string) => void}} props `options` are values and words */
+/** @param {ChoiceProps} props */
 export function Choice({ label, value, options, onChange }) {
 	return html`<label class="field">
 		${label}

@@ -9,7 +9,7 @@ from starlette.testclient import TestClient
 from service.api.pages import KINDS, PAGE, WEB
 from tests.web import pictures
 
-MOST_BYTES = 262_000
+MOST_BYTES = 250_000
 ROOT = WEB.parents[1]
 PROBLEM = "application/problem+json"
 FILES = sorted(path for path in WEB.rglob("*") if path.is_file())
