@@ -17,10 +17,10 @@ from model_export.photographed_sheets import (
     sweep,
 )
 from model_export.render import DISC
-from service.calibration.calibrate import Task, calibrate
-from service.calibration.fit import Interval
-from service.calibration.report import Method, Report
+from service.calibration.calibrate import calibrate
+from service.calibration.report import Interval, Method, Report
 from service.calibration.target import CircleGrid
+from service.calibration.task import Task
 from service.optics import thin_lens
 from service.optics.camera import Intrinsics
 

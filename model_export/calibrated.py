@@ -5,8 +5,9 @@ from functools import cache
 import numpy as np
 
 from model_export.photographed_sheets import GridCamera, sweep
-from service.calibration.calibrate import Task, calibrate
+from service.calibration.calibrate import calibrate
 from service.calibration.target import CircleGrid
+from service.calibration.task import Task
 from service.optics.camera import Camera
 
 # of A0: at the two metres that the scored cameras are focused at, a circle of a smaller one is a few pixels

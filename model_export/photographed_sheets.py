@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from model_export.render import DISC, GAUSSIAN, PointSpread, Spreads, blur_varying
-from service.calibration.calibrate import Picture, Shot
 from service.calibration.report import Role
 from service.calibration.target import CircleGrid
+from service.calibration.task import Picture, Shot
 from service.optics import thin_lens
 from service.optics.camera import Intrinsics
 from service.optics.light import encode_srgb

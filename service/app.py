@@ -1,7 +1,7 @@
 """The app: routes and middleware at once; database, model and worker only when it starts."""
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from functools import partial
 from importlib.metadata import version
@@ -9,7 +9,6 @@ from typing import Any
 
 from fastapi import Depends, FastAPI
 from fastapi_offline import FastAPIOffline
-from threadpoolctl import threadpool_limits
 
 from service.access import AllowOrigins, Authenticate
 from service.api import (
@@ -30,7 +29,8 @@ from service.api.clients import Followers
 from service.api.dependencies import require_known_parameters
 from service.api.problems import responses
 from service.api.uploads import Arrivals
-from service.calibration.calibrate import calibrate
+from service.calibration.report import Report
+from service.calibration.task import Picture, Task, Tell
 from service.compression import Compress
 from service.config import Settings
 from service.errors import BadRequest
@@ -60,6 +60,13 @@ TAGS = [
     {"name": "calibration", "description": "A camera's constants from a sheet of paper"},
     {"name": "service", "description": "The model, health and metrics"},
 ]
+
+
+def calibrate(task: Task, pictures: Sequence[Picture], tell: Tell, check: Callable[[], None]) -> Report:
+    """``service.calibration.calibrate.calibrate``, which loads SciPy: most starts are not for a calibration."""
+    from service.calibration.calibrate import calibrate
+
+    return calibrate(task, pictures, tell, check)
 
 
 def create_app(settings: Settings, calibrate: Calibrate = calibrate) -> FastAPI:
@@ -143,7 +150,6 @@ def _start(app: FastAPI) -> None:
     folder = load_model_folder(settings.served_model_dir)
     estimator = Estimator.from_folder(folder, intra_op_threads=settings.threads_per_worker)
     estimator.warm_up()
-    threadpool_limits(1, "blas")  # the sums of a calibration are small: more threads would wait for each other
     app.state.engine = engine
     app.state.keys = Keys(engine)
     app.state.model = folder

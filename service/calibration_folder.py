@@ -7,9 +7,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from service.calibration.calibrate import Picture, Shot, Task, calibrate
-from service.calibration.fit import Interval
-from service.calibration.report import PictureReport, Report, Role
+from service.calibration.calibrate import calibrate
+from service.calibration.report import Interval, PictureReport, Report, Role
+from service.calibration.task import Picture, Shot, Task
 from service.errors import InvalidImage
 from service.inference.images import SUFFIXES, ImageLimits, photographs_in, read_stored_frame
 from service.metres import in_words

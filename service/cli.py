@@ -230,8 +230,8 @@ def calibrate(
     owner: Owner = LOCAL,
 ) -> None:
     """Photographs of the sheet to a camera's k_cam, gamma, focus distance and intrinsics."""
-    from service.calibration.calibrate import Task
     from service.calibration.target import CircleGrid
+    from service.calibration.task import Task
     from service.calibration_folder import calibrate_folder, summary, write
     from service.inference.images import ImageLimits
 

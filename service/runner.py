@@ -17,9 +17,9 @@ import structlog
 from pydantic import ConfigDict, JsonValue, TypeAdapter
 from pydantic.dataclasses import dataclass
 
-from service.calibration.calibrate import Picture, Shot, Task, Tell
 from service.calibration.report import Method, PictureReport, Report, Result, Role
 from service.calibration.target import CircleGrid
+from service.calibration.task import Picture, Shot, Task, Tell
 from service.errors import CamindError
 from service.inference.cancellation import Cancelled
 from service.inference.images import ImageLimits, read_stored_frame

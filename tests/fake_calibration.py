@@ -14,9 +14,8 @@ from httpx2 import Request
 from pydantic import JsonValue
 from sqlalchemy import Engine
 
-from service.calibration.calibrate import Picture, Task
-from service.calibration.fit import CurvePoint, Interval
-from service.calibration.report import PictureReport, Report, Result, Sample
+from service.calibration.report import CurvePoint, Interval, PictureReport, Report, Result, Sample
+from service.calibration.task import Picture, Task
 from service.errors import CamindError
 from service.optics.camera import Intrinsics
 from service.storage.engine import writing

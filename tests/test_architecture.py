@@ -29,6 +29,16 @@ import os
 os.environ["CAMIND_PORT"] = "nonsense"
 import service.app, service.cli, service.config
 """
+LATE_SCIPY = """
+import sys
+import service.app, service.cli, service.depth_folder
+assert not [name for name in sys.modules if name.split(".")[0] == "scipy"]
+
+import service.calibration.look
+from threadpoolctl import threadpool_info
+libraries = [library for library in threadpool_info() if library["user_api"] == "blas"]
+assert libraries and all(library["num_threads"] == 1 for library in libraries), libraries
+"""
 
 
 def imports_of(path: Path) -> Iterator[str]:
@@ -63,7 +73,11 @@ def test_nothing_reads_the_settings_at_import() -> None:
     run_python(NO_SETTINGS_AT_IMPORT)
 
 
-@pytest.mark.parametrize("name", ["onnxruntime", "cv2"])
+def test_a_start_loads_no_scipy_and_what_comes_late_has_one_thread() -> None:
+    run_python(LATE_SCIPY)
+
+
+@pytest.mark.parametrize("name", ["onnxruntime", "cv2", "scipy"])
 def test_one_module_alone_imports(name: str) -> None:
     assert len(importers(name, SERVICE)) == 1
 

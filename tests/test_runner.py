@@ -14,8 +14,7 @@ import structlog
 from pydantic import JsonValue
 from sqlalchemy import Engine
 
-from service.calibration.fit import Interval
-from service.calibration.report import Result
+from service.calibration.report import Interval, Result
 from service.errors import Busy, NotReady
 from service.inference.images import ImageLimits
 from service.runner import MOST_ATTEMPTS, Calibrate, Runner

@@ -9,9 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
 from service.api.cursors import NextCursor
 from service.api.problems import invalid_request
 from service.api.schemas import FocusDistance, Given, IntrinsicsRead, Name
-from service.calibration.edge import Shape
-from service.calibration.look import Exposure, Look
-from service.calibration.report import Method, Role
+from service.calibration.report import Exposure, Look, Method, Role, Shape
 from service.calibration.target import CircleGrid, Kind
 from service.errors import BadRequest
 from service.inference.frame import FocalLengthFrom

@@ -12,7 +12,6 @@ from service.api.problems import responses
 from service.api.schemas import Name
 from service.api.target import GridDep
 from service.api.uploads import REQUEST_BODY, receive_photograph
-from service.calibration.look import look
 from service.calibration.target import CircleGrid
 from service.errors import BadRequest, Busy, InvalidImage, NotFound, TooLarge, UnsupportedKind
 from service.inference.cancellation import Cancellation
@@ -53,6 +52,8 @@ def _seen(
     cancellation: Cancellation, data: bytes, grid: CircleGrid, camera: Camera | None, limits: ImageLimits
 ) -> LookRead:
     """Decode and look: all the work of a request, in one thread."""
+    from service.calibration.look import look  # it loads SciPy
+
     frame = read_stored_frame(data, limits)
     cancellation.check()
     intrinsics, source = stored_intrinsics(frame, camera)

@@ -6,8 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from service.calibration import fit
 from service.calibration.edge import PointSpread, find_spread, fit_again
@@ -22,14 +20,13 @@ from service.calibration.measure import (
 )
 from service.calibration.pose import Placement, PoseError, place
 from service.calibration.refocus import refocused
-from service.calibration.report import Method, PictureReport, Report, Result, Role, Sample
+from service.calibration.report import PictureReport, Report, Result, Sample
 from service.calibration.sharpening import sharpened
 from service.calibration.solve import FEW_VIEWS
 from service.calibration.target import CircleGrid
+from service.calibration.task import Picture, Task, Tell
 from service.errors import CamindError
 from service.optics.camera import Intrinsics
-
-Tell = Callable[[float, tuple[PictureReport, ...]], None]
 
 FITTING_PART = 0.2  # of the progress
 BAD_VIEW = 4.0
@@ -39,35 +36,6 @@ MOST_ODD = 1 / 3  # of the pictures, that may be left out for being blurred othe
 CENTRE_TO, CORNER_FROM = 0.4, 0.7
 FIELD_DIFFERENCE = 0.1
 LEAST_FIELD_CIRCLES = 12
-
-
-@dataclass(frozen=True, slots=True)
-class Shot:
-    """A decoded photograph: RGB uint8 [h,w,3] as the sensor had it, and the aperture it says it was taken with."""
-
-    rgb: NDArray[np.uint8]
-    f_number: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """One photograph, decoded by ``load`` when it is its turn.
-
-    ``load`` may raise ``CamindError`` (the picture is then reported as not readable, with its words).
-    """
-
-    name: str
-    role: Role
-    load: Callable[[], Shot]
-
-
-@dataclass(frozen=True, slots=True)
-class Task:
-    """What is asked: the printed grid, the focus distance if it is known, and how to read blur."""
-
-    grid: CircleGrid
-    focus_distance_m: float | None = None
-    method: Method = "edge"
 
 
 def calibrate(
@@ -89,20 +57,19 @@ def calibrate(
         check()
         tell(progress, tuple(reports))
 
-    with threadpool_limits(1, "blas"):  # the sums are small: more threads would wait for each other
-        for number, picture in enumerate(pictures):
+    for number, picture in enumerate(pictures):
 
-            def at(part: float, number: int = number) -> None:
-                told((1 - FITTING_PART) * (number + part) / len(pictures))
+        def at(part: float, number: int = number) -> None:
+            told((1 - FITTING_PART) * (number + part) / len(pictures))
 
-            at(0.0)
-            one = _measured(task, picture, at, _partner(picture, measured))
-            measured.append(one)
-            reports.append(one.report)
-        try:
-            result = _result(task, measured, lambda part: told(1 - FITTING_PART + FITTING_PART * part))
-        except (PoseError, fit.FitError) as error:
-            return Report(tuple(one.report for one in measured), None, str(error))
+        at(0.0)
+        one = _measured(task, picture, at, _partner(picture, measured))
+        measured.append(one)
+        reports.append(one.report)
+    try:
+        result = _result(task, measured, lambda part: told(1 - FITTING_PART + FITTING_PART * part))
+    except (PoseError, fit.FitError) as error:
+        return Report(tuple(one.report for one in measured), None, str(error))
     return Report(tuple(one.report for one in measured), result, None)
 
 

@@ -10,18 +10,21 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import RectBivariateSpline
-from scipy.ndimage import correlate1d
-from scipy.optimize import least_squares, minimize_scalar
-from scipy.special import chndtr, ndtr
 
+from service.calibration.numerics import (
+    RectBivariateSpline,
+    chndtr,
+    correlate1d,
+    least_squares,
+    minimize_scalar,
+    ndtr,
+)
+from service.calibration.report import Shape
 from service.optics import thin_lens
 
-Shape = Literal["gaussian", "disc"]
 Array = NDArray[np.float64]
 
 ALL_RIM = 0.97  # softness over blur from which there is no disc left to see

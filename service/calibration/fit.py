@@ -13,9 +13,9 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
-from scipy.special import stdtrit
 
+from service.calibration.numerics import least_squares, stdtrit
+from service.calibration.report import CurvePoint, Interval
 from service.metres import in_words
 from service.optics import thin_lens
 
@@ -80,29 +80,6 @@ class Circles:
 
 
 Fit = Callable[[Circles, Array | None], Array]  # to constants, from others near by
-
-
-@dataclass(frozen=True, slots=True)
-class Interval:
-    """A value and where it lies with a confidence of 95 %."""
-
-    value: float
-    low: float
-    high: float
-
-    @property
-    def relative_width(self) -> float:
-        return (self.high - self.low) / self.value
-
-
-@dataclass(frozen=True, slots=True)
-class CurvePoint:
-    """Lambda at one depth by the constants found, and where it lies with a confidence of 95 %."""
-
-    depth_m: float
-    blur_px: float
-    low_px: float
-    high_px: float
 
 
 @dataclass(frozen=True, slots=True)

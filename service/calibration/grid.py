@@ -13,8 +13,8 @@ from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from service.calibration.numerics import cKDTree
 from service.calibration.target import CircleGrid, Kind
 from service.opencv import cv2
 

@@ -3,56 +3,18 @@
 import itertools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.calibration.measure import Measured, measure, otherwise_sized
 from service.calibration.pose import View, stand
-from service.calibration.report import PictureReport
+from service.calibration.report import Circle, Look, PictureReport
 from service.calibration.target import CircleGrid
 from service.optics.camera import Intrinsics
 
-Exposure = Literal["good", "over", "under"]
-
 WHITE_LEVEL = 255
 MOST_MEASURED = 12
-
-
-@dataclass(frozen=True, slots=True)
-class Circle:
-    """Where a printed circle is in the picture, and about how large."""
-
-    u_px: float
-    v_px: float
-    radius_px: float
-
-
-@dataclass(frozen=True, slots=True)
-class Look:
-    """What one photograph shows; None for what it does not tell.
-
-    ``circles`` are all of the grid, row by row, those too that were filled in from their neighbours. At most a dozen,
-    in all columns, are measured; ``measured`` gave a blur, and ``blur_px`` is its median. ``paper_level`` is how bright
-    the white between them is, 0 to 1.
-    """
-
-    width_px: int
-    height_px: int
-    circles: tuple[Circle, ...] = ()
-    measured: int = 0
-    blur_px: float | None = None
-    distance_m: float | None = None
-    tilt_deg: float | None = None
-    exposure: Exposure | None = None
-    paper_level: float | None = None
-    warnings: tuple[str, ...] = ()
-
-    @property
-    def found(self) -> bool:
-        return bool(self.circles)
 
 
 def look(

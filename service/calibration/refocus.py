@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from service.calibration.fit import SLOPE_ERROR, Circles, Constants, blur_of, errors_of
+from service.calibration.numerics import least_squares
 from service.optics import thin_lens
 
 Array = NDArray[np.float64]

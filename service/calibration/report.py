@@ -1,14 +1,37 @@
-"""What a calibration tells: of every picture, of every circle, and of the camera."""
+"""What a calibration tells: of every picture, of every circle, and of the camera; and what a look does."""
 
 from dataclasses import dataclass
 from typing import Literal
 
-from service.calibration.edge import Shape
-from service.calibration.fit import CurvePoint, Interval
 from service.optics.camera import Camera, Intrinsics
 
 Role = Literal["focused", "defocused"]
 Method = Literal["edge", "paper"]
+Shape = Literal["gaussian", "disc"]
+Exposure = Literal["good", "over", "under"]
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """A value and where it lies with a confidence of 95 %."""
+
+    value: float
+    low: float
+    high: float
+
+    @property
+    def relative_width(self) -> float:
+        return (self.high - self.low) / self.value
+
+
+@dataclass(frozen=True, slots=True)
+class CurvePoint:
+    """Lambda at one depth by the constants found, and where it lies with a confidence of 95 %."""
+
+    depth_m: float
+    blur_px: float
+    low_px: float
+    high_px: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,3 +115,37 @@ class Report:
     pictures: tuple[PictureReport, ...]
     result: Result | None
     problem: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Circle:
+    """Where a printed circle is in the picture, and about how large."""
+
+    u_px: float
+    v_px: float
+    radius_px: float
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What one photograph shows; None for what it does not tell.
+
+    ``circles`` are all of the grid, row by row, those too that were filled in from their neighbours. At most a dozen,
+    in all columns, are measured; ``measured`` gave a blur, and ``blur_px`` is its median. ``paper_level`` is how bright
+    the white between them is, 0 to 1.
+    """
+
+    width_px: int
+    height_px: int
+    circles: tuple[Circle, ...] = ()
+    measured: int = 0
+    blur_px: float | None = None
+    distance_m: float | None = None
+    tilt_deg: float | None = None
+    exposure: Exposure | None = None
+    paper_level: float | None = None
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def found(self) -> bool:
+        return bool(self.circles)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
+from service.calibration.numerics import least_squares
 from service.opencv import cv2
 
 Array = NDArray[np.float64]

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from model_export.photographed_sheets import picture
-from service.calibration.calibrate import Picture, Shot, Task, calibrate
 from service.calibration.calibrate import _corner_ratio as corner_ratio
 from service.calibration.calibrate import _uneven as uneven
+from service.calibration.calibrate import calibrate
 from service.calibration.measure import Measured, aperture_of, ill_exposed, measure, too_blurred
 from service.calibration.plot import as_svg
 from service.calibration.report import PictureReport, Report, Role
+from service.calibration.task import Picture, Shot, Task
 from service.errors import InvalidImage
 from service.inference.cancellation import Cancelled
 from service.opencv import cv2

@@ -6,9 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from threading import Barrier
 
-from service.calibration.fit import CurvePoint
 from service.calibration.plot import as_svg
-from service.calibration.report import Result, Sample
+from service.calibration.report import CurvePoint, Result, Sample
 from tests.fake_calibration import RESULT
 
 
