@@ -13,7 +13,7 @@ from service.inference.hypotheses import SIGMA_OF_LAPLACE, in_metres, merged
 from service.inference.pair import RawMaps, Side
 from service.inference.part import Part
 from service.inference.resampling import WHOLE_PX, Lines, Ratio, bands, sample, shrunk_size
-from service.opencv import exp, where
+from service.opencv import cv2, exp, where
 from service.optics import thin_lens
 from service.optics.camera import Camera
 
@@ -249,9 +249,10 @@ def decide(reading: Reading, size: tuple[int, int]) -> tuple[Array, NDArray[np.b
     """Depth (height, width) and which pixels have an answer."""
     depth_m, valid = np.empty(size, np.float32), np.empty(size, np.bool_)
     for rows in bands(size, WHOLE_PX):
-        depth_m[rows], error = _sampled(reading, rows, size[1], "depth_m", "error")
-        valid[rows] = error <= MAX_RELATIVE_ERROR
-    depth_m[~valid] = np.nan
+        sampled_m, error = _sampled(reading, rows, size[1], "depth_m", "error")
+        np.less_equal(error, MAX_RELATIVE_ERROR, out=valid[rows])
+        depth_m[rows] = np.nan
+        cv2.copyTo(sampled_m, valid[rows].view(np.uint8), depth_m[rows])
     return depth_m, valid
 
 

@@ -77,8 +77,9 @@ TURNS: dict[int, tuple[bool, bool, bool]] = {
 }
 # the orientation that undoes each
 UNTURNS = {orientation: {6: 8, 8: 6}.get(orientation, orientation) for orientation in TURNS}
-# not IMREAD_COLOR_RGB: OpenCV 5.0 leaves a 16-bit TIFF read so uninitialised
+# not IMREAD_COLOR_RGB for all: OpenCV 5.0 leaves a 16-bit TIFF read so uninitialised
 DECODE_FLAGS = cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+JPEG_FLAGS = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
 # below which metres go wrong: faint texture is lost, and a webp's filter blurs
 LEAST_QUALITY: dict[Kind, int] = {"jpeg": 75, "webp": 76}
 CLIPPED_LEVEL, CLIPPED_SHARE, CLIPPED_EVERY = 253, 0.25, 4  # of all colours; of the pixels, from where on it is told
@@ -219,7 +220,8 @@ def _require_size(width_px: int, height_px: int, limits: ImageLimits) -> None:
 
 
 def _decode(data: bytes, header: Header) -> tuple[NDArray[np.uint8], Mask | None, tuple[str, ...]]:
-    flags = cv2.IMREAD_UNCHANGED if header.has_alpha else DECODE_FLAGS
+    is_jpeg = header.kind == "jpeg"
+    flags = cv2.IMREAD_UNCHANGED if header.has_alpha else JPEG_FLAGS if is_jpeg else DECODE_FLAGS
     try:
         pixels = cv2.imdecode(np.frombuffer(_picture(data, header), np.uint8), flags)
     except cv2.error as exc:
@@ -230,7 +232,8 @@ def _decode(data: bytes, header: Header) -> tuple[NDArray[np.uint8], Mask | None
         raise InvalidImage(f"The {header.kind} file cannot be decoded: it is damaged or of an unusual form.")
     colours, hidden = _without_alpha(pixels)
     eight_bits, warnings = _eight_bits(colours)
-    return np.asarray(cv2.cvtColor(eight_bits, cv2.COLOR_BGR2RGB), np.uint8), hidden, warnings
+    rgb = eight_bits if is_jpeg else cv2.cvtColor(eight_bits, cv2.COLOR_BGR2RGB)
+    return np.asarray(rgb, np.uint8), hidden, warnings
 
 
 def _without_alpha(pixels: NDArray[Any]) -> tuple[NDArray[Any], Mask | None]:
