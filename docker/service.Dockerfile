@@ -12,6 +12,8 @@ RUN /opt/camind/bin/python -m pip install --no-cache-dir --require-hashes -r req
 RUN /opt/camind/bin/python -m pip install --no-cache-dir --no-deps --build-constraint requirements/build.txt .
 
 FROM python:3.11-slim-bookworm
+# it comes without bytecode, which nobody may write later: each start and each look at its health would compile anew
+RUN python3 -m compileall -q -x site-packages /usr/local/lib/python3.*
 RUN useradd --system --uid 10001 --home-dir /data --create-home camind
 COPY --from=build /opt/camind /opt/camind
 ENV PATH=/opt/camind/bin:$PATH \

@@ -88,6 +88,12 @@ def test_the_service_runs_as_nobody_in_particular() -> None:
     assert "read_only: true" in (ROOT / "docker" / "compose.yaml").read_text()
 
 
+def test_the_images_own_python_is_compiled_while_it_may_be_written() -> None:
+    words, commands = zip(*stage(SERVICE, 1), strict=True)
+    (compiled,) = (number for number, command in enumerate(commands) if "-m compileall" in command)
+    assert compiled < words.index("USER")
+
+
 def test_health_is_asked_for_at_the_port_that_is_set(tmp_path: Path, tiny_model_dir: Path) -> None:
     command: list[str] = json.loads(dict(stage(SERVICE, 1))["HEALTHCHECK"].partition("CMD ")[2])
     with serving(tmp_path / "data", "--model", tiny_model_dir) as server:
