@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from model_export.render import DISC, GAUSSIAN, PointSpread, blur
-from service.calibration.edge import EdgeError, fit_edge, slice_blur
+from service.calibration.edge import EdgeError, find_spread, fit_again, fit_edge, slice_blur
 
 SIZE = 128
 FINE = 8
@@ -107,6 +107,25 @@ def test_what_cannot_be_measured_is_said(
 def test_the_papers_slice_reads_a_third_more() -> None:
     total = math.sqrt(4.0**2 + 1 / 12)
     assert slice_blur(photographed(circle(), 4.0, GAUSSIAN), 63.3, 64.8, 24) == pytest.approx(1.329 * total, rel=0.03)
+
+
+@pytest.mark.parametrize("place", [(45, 64), (83, 64), (64, -1), (64, SIZE)])
+def test_the_papers_slice_is_within_the_picture_and_shows_something(place: tuple[float, float]) -> None:
+    with pytest.raises(EdgeError, match="border"):
+        slice_blur(circle(), *place, 24)
+    with pytest.raises(EdgeError, match="no circle"):
+        slice_blur(np.ones((SIZE, SIZE), np.float32), 64, 64, 24)
+
+
+@pytest.mark.parametrize("lens", [GAUSSIAN, DISC], ids=["gaussian", "disc"])
+def test_a_lens_whose_most_blurred_circles_tell_its_point_spread_is_read_right_throughout(lens: PointSpread) -> None:
+    gamma, soft = math.sqrt(0.6**2 + 1 / 12), photographed(circle(), 0.6, GAUSSIAN)
+    edges = [fit_edge(photographed(soft, sigma, lens), 64, 64, 23) for sigma in (0.5, 3.0, 5.0)]
+    spread = find_spread(edges, gamma, lambda: None)
+    assert spread.shape == ("disc" if lens is DISC else "gaussian")
+    for edge, sigma, off in zip(edges, (0.5, 3.0, 5.0), (0.02, 0.002, 0.002), strict=True):
+        assert fit_again(edge, spread).blur_px == pytest.approx(math.hypot(sigma, gamma), rel=off)
+    assert find_spread(edges[:1], gamma, lambda: None).shape == "gaussian", "which is as good where none is blurred"
 
 
 def test_a_narrow_ellipse_is_too_tilted() -> None:

@@ -49,6 +49,33 @@ def test_exact_circles_are_fitted_exactly() -> None:
     assert found.rms_px < 1e-3
 
 
+def test_the_curve_is_that_of_the_camera_over_all_depths() -> None:
+    some = circles(BOTH_SIDES, error=0.0)
+    curve = fit_constants(some, resamples=5).curve
+    depth_m = np.array([point.depth_m for point in curve])
+    assert depth_m.min() < some.depth_m.min() < some.depth_m.max() < depth_m.max()
+    assert np.ptp(np.diff(1 / depth_m)) < 1e-9, "in equal steps of 1/z"
+    true = thin_lens.blur_at_depth(depth_m, FOCUS, K_CAM, GAMMA)
+    np.testing.assert_allclose([point.blur_px for point in curve], true, rtol=1e-4)
+    assert all(point.low_px < point.blur_px < point.high_px for point in curve)
+
+
+def test_circles_none_of_which_is_nearly_sharp_tell_k_cam_too() -> None:
+    some = circles((0.5, 0.6, 0.7, 1.9, 2.4), error=0.0)
+    blur = np.asarray(thin_lens.blur_at_depth(some.depth_m, FOCUS, 75.0, GAMMA))
+    assert blur.min() > 25
+    found = fit_constants(replace(some, blur_px=blur), resamples=0)
+    assert found.k_cam_px.value == pytest.approx(75.0, rel=1e-3)
+
+
+def test_a_fit_can_be_stopped() -> None:
+    def stop() -> None:
+        raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        fit_constants(circles(BOTH_SIDES), tick=stop)
+
+
 def test_the_intervals_hold() -> None:
     held = 0
     for seed in range(20):
@@ -241,6 +268,8 @@ def test_the_papers_k_cam_is_what_most_circles_tell(times: float) -> None:
     assert found.gamma_px.value == pytest.approx(GAMMA)
     with pytest.raises(FitError, match="focused and of defocused"):
         fit_as_paper(circles(BOTH_SIDES), FOCUS, depth_error=0.0, resamples=0)
+    with pytest.raises(FitError, match="no circle is blurred"):
+        fit_as_paper(replace(some, blur_px=np.where(is_focused, GAMMA, 0.9 * GAMMA)), FOCUS, depth_error=0, resamples=2)
 
 
 @pytest.mark.parametrize("given", [None, FOCUS])

@@ -56,6 +56,17 @@ def test_a_focus_or_an_aperture_that_changed_is_said_though_one_curve_fits(
     assert re.match(r"within photographs .* had moved by \d+% between them: .* lock focus", words[0])
 
 
+def test_of_a_focus_that_hardly_moved_and_of_mere_noise_nothing_is_said() -> None:
+    moved = [FOCUS * part for part in (0.98, 0.99, 1.0, 1.01, 1.02)]
+    some = circles(moved)
+    focus = np.array(moved)[some.picture]
+    exact = np.asarray(thin_lens.blur_at_depth(some.depth_m, focus, K_CAM * FOCUS / focus, GAMMA))
+    noise = 0.1 * np.random.default_rng(101).standard_normal(some.picture.size)
+    still = circles([FOCUS] * 5, seed=1)
+    for one in (replace(some, blur_px=exact), replace(still, blur_px=still.blur_px * np.exp(noise))):
+        assert not said(one)[1]
+
+
 def test_photographs_that_tell_nothing_of_it_are_passed_over() -> None:
     some = circles(FOLLOWED)
     found = fit_constants(some, resamples=0)

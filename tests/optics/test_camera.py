@@ -1,11 +1,14 @@
 """The camera: bounds, resizing, refocusing."""
 
+import itertools
 import math
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from service.opencv import cv2
 from service.optics import thin_lens
 from service.optics.camera import Camera, Intrinsics, Lens
 
@@ -121,6 +124,29 @@ def test_a_lens_that_tilts_tilts_as_its_picture_is_turned() -> None:
     turned = inner.turned(False, True, True, (640, 480)).distortion
     assert (turned[2:4], turned[12:]) == ((-terms[2], -terms[3]), (-terms[12], -terms[13]))
     assert inner.turned(True, False, False, (480, 640)).distortion[12:] == (-terms[13], -terms[12])
+
+
+@pytest.mark.parametrize("tilts", [(0.02, 0.0), (0.0, 0.03)])
+@pytest.mark.parametrize("turn", [*itertools.product((False, True), repeat=3)])
+def test_what_is_seen_is_at_its_place_in_the_turned_picture(
+    turn: tuple[bool, bool, bool], tilts: tuple[float, float]
+) -> None:
+    rational, prism = (-0.2, 0.05, 3e-3, -2e-3, 0.01, 0.02, -0.01, 5e-3), (4e-3, -1e-3, 2e-3, 3e-3)
+    upright = Camera(640, 480, 2.0, 3.81, intrinsics=Intrinsics(500, 510, 300, 230, (*rational, *prism, *tilts)))
+    points = np.random.default_rng(0).uniform((-0.5, -0.4, 1), (0.5, 0.4, 1), (20, 3))
+
+    def seen(by: Camera) -> NDArray[np.float64]:
+        assert by.intrinsics is not None
+        matrix, distortion = np.array(by.intrinsics.matrix), np.array(by.intrinsics.distortion)
+        return np.asarray(cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)[0]).reshape(-1, 2)
+
+    places, turned = seen(upright), upright.turned(*turn)
+    if turn[0]:
+        places, points = places[:, ::-1], points[:, [1, 0, 2]]
+    size_px = np.array((turned.image_width_px, turned.image_height_px))
+    places = np.where(turn[1:], size_px - 1 - places, places)
+    points *= (*np.where(turn[1:], -1, 1), 1)
+    np.testing.assert_allclose(seen(turned), places, atol=1e-6)
 
 
 def test_both_axes_follow_their_own_ratio() -> None:
