@@ -65,6 +65,8 @@ def solve(
         flags=flags,
         criteria=CRITERIA,
     )
+    if not (matrix.diagonal().min() > 0 and math.isfinite(rms)):
+        raise cv2.error("no camera shows the points so")
     return Solved(
         float(rms),
         np.asarray(matrix, np.float64),

@@ -180,6 +180,20 @@ def test_another_camera_s_view_does_not_fit() -> None:
     assert np.argmax(found.rms_px) == 3
 
 
+@pytest.mark.parametrize("seed", [0, 2])
+def test_circles_where_no_camera_would_see_them_are_said(seed: int) -> None:
+    """Two such sheets may give a focal length below 0."""
+    rng = np.random.default_rng(seed)
+    mixed = [View(view.circles, rng.permutation(view.centres_px)) for view in views(flat(FEWER), 2)[0]]
+    with pytest.raises(PoseError, match="no camera would see the grid like that"):
+        place(FEWER, mixed, SIZE)
+
+
+def test_too_few_circles_stand_nowhere(found: Placement) -> None:
+    view = views(flat())[0][0]
+    assert stand(GRID, View(view.circles[:3], view.centres_px[:3]), found.intrinsics) == (None, None)
+
+
 def test_one_sheet_that_is_not_tilted_is_no_matter() -> None:
     (straight, *_), _ = views(flat(FEWER), tilted=0.0)
     tilted, _ = views(flat(FEWER))
