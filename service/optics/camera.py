@@ -197,8 +197,6 @@ class Camera:
 
         Raises ``ValueError`` if the lens cannot focus there.
         """
-        if not (math.isfinite(focus_distance_m) and focus_distance_m > 0):
-            raise ValueError(f"focus_distance_m must be a positive number, not {focus_distance_m}")
         k_cam_px = thin_lens.k_cam_at_focus(
             self.k_cam_px, self.focal_length_m or 0.0, self.focus_distance_m, focus_distance_m
         )

@@ -111,6 +111,12 @@ def test_refocusing_without_a_focal_length_takes_it_as_short() -> None:
     assert camera().focused_at(1.0).k_cam_px == pytest.approx(2 * 3.81)
 
 
+@pytest.mark.parametrize("focus_m", [0.0, -1.0, math.nan, math.inf])
+def test_no_lens_is_refocused_to_nowhere(focus_m: float) -> None:
+    with pytest.raises(ValueError, match="focus"):
+        camera().focused_at(focus_m)
+
+
 def test_range_ends_where_a_quarter_pixel_is_ten_percent() -> None:
     near, far = camera().range_m
     assert near == 0
@@ -140,10 +146,10 @@ def test_what_is_seen_is_at_its_place_in_the_turned_picture(
         matrix, distortion = np.array(by.intrinsics.matrix), np.array(by.intrinsics.distortion)
         return np.asarray(cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)[0]).reshape(-1, 2)
 
-    places, turned = seen(upright), upright.turned(*turn)
+    places, turned, size_px = seen(upright), upright.turned(*turn), np.array((640, 480))
     if turn[0]:
-        places, points = places[:, ::-1], points[:, [1, 0, 2]]
-    size_px = np.array((turned.image_width_px, turned.image_height_px))
+        places, points, size_px = places[:, ::-1], points[:, [1, 0, 2]], size_px[::-1]
+    assert (turned.image_width_px, turned.image_height_px, turned.k_cam_px) == (*size_px, 3.81)
     places = np.where(turn[1:], size_px - 1 - places, places)
     points *= (*np.where(turn[1:], -1, 1), 1)
     np.testing.assert_allclose(seen(turned), places, atol=1e-6)
