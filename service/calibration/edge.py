@@ -146,8 +146,6 @@ def find_spread(edges: Sequence[EdgeFit], gamma_px: float, tick: Callable[[], No
     def of_disc(softness: float) -> float:
         return left_over(PointSpread("disc", softness * gamma_px))
 
-    if not blurred:
-        return PointSpread("gaussian")
     best = minimize_scalar(of_disc, bounds=SOFTNESS_BOUNDS, method="bounded", options={"xatol": SOFTNESS_STEP})
     is_disc = best.fun < left_over(PointSpread("gaussian"))
     return PointSpread("disc", float(best.x) * gamma_px) if is_disc else PointSpread("gaussian")

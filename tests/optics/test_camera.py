@@ -144,7 +144,8 @@ def test_what_is_seen_is_at_its_place_in_the_turned_picture(
     def seen(by: Camera) -> NDArray[np.float64]:
         assert by.intrinsics is not None
         matrix, distortion = np.array(by.intrinsics.matrix), np.array(by.intrinsics.distortion)
-        return np.asarray(cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)[0]).reshape(-1, 2)
+        shown, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)
+        return np.asarray(shown, np.float64).reshape(-1, 2)
 
     places, turned, size_px = seen(upright), upright.turned(*turn), np.array((640, 480))
     if turn[0]:
