@@ -25,7 +25,7 @@ LOG_ERROR_BOUNDS = (-5.0, 1.5)
 RATIO_BOUND = 3.5
 # A network draws towards focus what is little out of it, however well its blur is read. Plain inversion tells where its
 # variance, so many times, is below the network's (odds grow with this power of their ratio), and both are hardly apart
-# (ln z, standard deviation of a normal law): docs/training.md
+# (ln z, standard deviation of a normal law): docs/findings.md
 PLAIN_DOUBT, PLAIN_POWER, PLAIN_APART = 6.0, 3.0, 0.1
 GREY = 0.5
 

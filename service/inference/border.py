@@ -1,7 +1,7 @@
 """A black border about a photograph: bars of a film, corners of a rectified or turned picture, what a fisheye leaves.
 
 It shows nothing, but its outline is a sharp line, and what is near that is read as in focus: table tops with bars an
-eighth of the height were off by 0.36 for 0.10, with the border of rectified pictures by 0.71 (docs/training.md). So
+eighth of the height were off by 0.36 for 0.10, with the border of rectified pictures by 0.71 (docs/findings.md). So
 what is seen is continued into it, mirrored, and nothing is answered there.
 """
 

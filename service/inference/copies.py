@@ -19,7 +19,7 @@ from service.optics.camera import Camera
 
 # of gamma, and of the pixels: what is read too sharp of scenes whose gamma is known is no more
 CLEARLY_SHARPER, SHARPER_FRACTION = 0.7, 0.1
-MAY_BE_SHARPER_PX = 0.6  # nothing is read as sharper than 0.42 px (docs/training.md)
+MAY_BE_SHARPER_PX = 0.6  # nothing is read as sharper than 0.42 px (docs/findings.md)
 SHARPEST = 0.05  # of the pixels, as sharp as whose gamma then is taken to be
 OCTAVES = np.float32(1 / np.log(2))
 

@@ -33,7 +33,7 @@ WIDE_PX, FINE_K_CAM_PX = 640, 5.0
 LEAST_PX = 96  # the longer side of any such copy: of a smaller one nothing is left
 # what is as blurred as this part of the most that the model was trained on is read better on a copy of half the size,
 # where it is half as blurred and more of its surroundings is seen, and so on: table tops by k_cam 2.64 to 10.7 px
-# 0.105, 0.112, 0.103, 0.122 m, where it is 0.2 0.109, 0.116, 0.100, 0.127, indoor frames alike (docs/training.md)
+# 0.105, 0.112, 0.103, 0.122 m, where it is 0.2 0.109, 0.116, 0.100, 0.127, indoor frames alike (docs/findings.md)
 STRONG_BLUR = 0.17
 SMALLER_COPIES = 2
 STRONG_FRACTION = 1e-3  # of the picture: a few cells' noise is not worth the time, and in them alone a part may differ

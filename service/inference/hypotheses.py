@@ -10,7 +10,7 @@ LEAST_P_NEAR = 0.35
 LEAST_DOUBT = np.float32(1e-6)
 ALL_IN_DOUBT = 0.54  # of ln z: its deviation in metres is as large as the depth
 MOST_IN_METRES = 0.95  # of depth: what is in such doubt grows but slowly from there, to the whole depth
-# x at which log odds of the side count half: chosen on the development sets, 0.05 to 0.17 do as well (docs/training.md)
+# x at which log odds of the side count half: chosen on the development sets, 0.05 to 0.17 do as well (docs/findings.md)
 HARDLY_OUT = 0.07
 
 Array = NDArray[np.float32]

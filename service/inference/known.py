@@ -26,7 +26,7 @@ from service.optics.camera import Camera
 from service.optics.focus import Sighting, fit_focus
 
 MOST_DEVIATIONS = 3.0
-# chosen on the development sets, three known depths a picture (docs/training.md)
+# chosen on the development sets, three known depths a picture (docs/findings.md)
 SURELY_OUT = 0.15  # x from where on a known depth tells its side
 SURE_SIDE = 0.95  # of a right tape's depths that tell their side, a picture is as sure of the other one in 1 of 51
 SHARED_ODDS = 2.0  # standard deviation, over pictures, of what all of a picture's log odds of the side are off by

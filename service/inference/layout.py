@@ -4,7 +4,7 @@ A floor is nearer below, what stands before a wall is nearer than it: that is se
 tile, at the size that it is given, so of a picture larger than those that it learned of the coarsest maps of all tiles
 are put together, made smaller, and asked at once. Refocused frames of three times their size, focused at 0.7, 1.0 and
 1.5 m, are told the right side for 70, 78 and 80 % of what is out of focus, by their tiles alone for 64, 71 and 73 %
-(docs/training.md).
+(docs/findings.md).
 """
 
 import numpy as np

@@ -17,7 +17,7 @@ from service.opencv import cv2, exp, log, where
 CELLS = 8  # of the maps, each way, whose mean is one in what surrounds them
 FEWER = 2  # cells each way that are drawn alike
 REACH, MOST_REACH_PX = 0.15, 96  # to all sides, of the copy that was read: a part of its longer side, and at most
-# chosen on the development sets, where half or twice as much hardly matters (docs/training.md)
+# chosen on the development sets, where half or twice as much hardly matters (docs/findings.md)
 OWN_SPREAD = 0.2  # by how much a thing is off what surrounds it (ln z, standard deviation), where that is flat
 UNEVEN_WEIGHT = 4.0  # how often the variance of what surrounds it comes to that
 LEVELNESS = 0.2  # what a plane's slopes are held back by, in variances of even surroundings of half-width 1

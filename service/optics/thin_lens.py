@@ -92,7 +92,7 @@ def gamma_after_shrinking(gamma_px: float, ratio: float) -> float:
     """gamma in pixels of a copy ``ratio`` (up to 1) of the size, made small by a filter that is not known.
 
     It is again as soft by the pixel as such copies are, as far as gamma was, and the rest of it scales. Measured, on
-    photographs that box, bilinear, bicubic and Lanczos filters made two to six times as small (docs/training.md).
+    photographs that box, bilinear, bicubic and Lanczos filters made two to six times as small (docs/findings.md).
     """
     own = min(SHRUNK_GAMMA_PX, gamma_px) ** 2
     return math.sqrt((gamma_px**2 - own) * ratio**2 + own)
