@@ -36,6 +36,19 @@ class Frame:
         return float(np.exp(np.log(self.depth_m.astype(np.float32)).mean()))
 
 
+@dataclass(frozen=True, slots=True)
+class Crop:
+    """A part of a frame, perhaps made small: linear light [h,w,3], depth in metres [h,w], focal length in px.
+
+    ``softness`` is the variance (px^2) of the blur that it has beside its pixels' box, for having been made small.
+    """
+
+    light: Map
+    depth_m: Map
+    focal_length_px: float
+    softness: float
+
+
 def load_frames(folder: Path) -> list[Frame]:
     """All frames of a folder with ``color/``, ``depth/`` and ``cameras.json``. Raises if there is none."""
     cameras = load_cameras(folder, ("fx_px",))
@@ -55,11 +68,8 @@ def draw_frame(rng: np.random.Generator, frames: Sequence[Frame]) -> Frame:
     return frames[int(rng.choice(len(frames), p=weights / weights.sum()))]
 
 
-def draw_view(rng: np.random.Generator, frame: Frame, size: int) -> tuple[Map, Map, float, float]:
-    """A part of the frame, mirrored where it ends: linear light [size,size,3], depth [size,size] m, focal length px.
-
-    The last is the variance (px^2) of the blur it has beside its pixels' box, for having been made small.
-    """
+def draw_crop(rng: np.random.Generator, frame: Frame, size: int) -> Crop:
+    """A square of that many pixels of the frame, mirrored where it ends, under other light."""
     least = min(max(SIZES[0], size / min(frame.image.shape[:2])), SIZES[1])
     grow = math.exp(rng.uniform(math.log(least), math.log(SIZES[1])))
     height, width = (round(grow * side) for side in frame.image.shape[:2])
@@ -71,7 +81,7 @@ def draw_view(rng: np.random.Generator, frame: Frame, size: int) -> tuple[Map, M
     light = (light ** rng.uniform(*CONTRASTS)) * rng.uniform(*TINTS, 3).astype(np.float32)
     depth = np.asarray(depth_m, np.float32)[rows][:, columns]
     softness = thin_lens.averaging_variance(frame.image.shape[1], width)
-    return light.astype(np.float32), depth, grow * frame.focal_length_px, softness
+    return Crop(light.astype(np.float32), depth, grow * frame.focal_length_px, softness)
 
 
 def _window(rng: np.random.Generator, side: int, size: int) -> NDArray[np.intp]:

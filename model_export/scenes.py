@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from model_export.config import SceneConfig
-from model_export.frames import Frame, draw_frame, draw_view
+from model_export.frames import Frame, draw_crop, draw_frame
 from model_export.render import Layer, PointSpread, blur, render_layers, sliced
 from model_export.rooms import Surface, draw_room
 from model_export.textures import draw_texture
@@ -74,6 +74,19 @@ class Shot:
 
 
 @dataclass(frozen=True, slots=True)
+class Scene:
+    """Surfaces before the lens of a shot: nearest first, with q - 1 of each over the canvas [layers,h,w].
+
+    ``softness`` is the variance (px^2) of the blur that they have themselves.
+    """
+
+    shot: Shot
+    layers: list[Layer]
+    excesses: Map
+    softness: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class Sample:
     """One training example: picture uint8 [3,h,w] (sRGB), q - 1 as float16 [h,w], and the shot."""
 
@@ -87,8 +100,7 @@ class Negative:
     """A scene whose picture is still to be taken (``darkroom.py``), by a camera about that of ``shot``.
 
     ``surfaces`` [layers,5,h,w] in float16 are premultiplied linear colour, alpha and q - 1, nearest first, ``ends``
-    [2,layers] the least and greatest q - 1 of each; ``softness`` is the variance (px^2) of the blur that they have
-    themselves.
+    [2,layers] the least and greatest q - 1 of each; ``softness`` is the scene's.
     """
 
     surfaces: torch.Tensor
@@ -222,10 +234,10 @@ def _apart(rng: np.random.Generator, shot: Shot, config: SceneConfig, count: int
     return [*((_outline(rng, size), shape) for shape in shapes), (np.ones((size, size), np.float32), background)]
 
 
-def draw_layers(
+def _drawn_scene(
     rng: np.random.Generator, shot: Shot, config: SceneConfig, photographs: list[NDArray[np.uint8]]
-) -> tuple[list[Layer], Map]:
-    """The scene's surfaces, nearest first, and q - 1 of each over the canvas [layers,h,w]."""
+) -> Scene:
+    """A wall, a room, or shapes before each other."""
     size = config.size_px + 2 * config.margin_px
 
     def draw(texture_size: int) -> Map:
@@ -263,7 +275,7 @@ def draw_layers(
         )
         for surface in surfaces
     ]
-    return layers, np.stack([surface.excess for surface in surfaces])
+    return Scene(shot, layers, np.stack([surface.excess for surface in surfaces]))
 
 
 def _through_mosaic(linear: Map) -> Map:
@@ -340,28 +352,29 @@ def develop(
     return np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)[:, :, ::-1]
 
 
-def _frame_layers(
-    rng: np.random.Generator, shot: Shot, config: SceneConfig, frame: Frame
-) -> tuple[Shot, list[Layer], Map, float]:
+def _framed_scene(rng: np.random.Generator, shot: Shot, config: SceneConfig, frame: Frame) -> Scene:
     """A frame before the shot's lens, which is focused so that one of its pixels is as far out of focus as may be.
 
-    Distances stay as they are. Where the blur would be more than the config allows, so is the shot's k_cam. The last is
-    the variance of the blur that the frame has itself.
+    Distances stay as they are. Where the blur would be more than the config allows, so is the shot's k_cam.
     """
     size = config.size_px + 2 * config.margin_px
-    light, depth_m, focal_length_px, softness = draw_view(rng, frame, size)
-    anchor_m = float(depth_m[tuple(rng.integers(config.margin_px, size - config.margin_px, 2))])
+    crop = draw_crop(rng, frame, size)
+    anchor_m = float(crop.depth_m[tuple(rng.integers(config.margin_px, size - config.margin_px, 2))])
     focus_m = float(np.clip(anchor_m * (1 + _draw_excess(rng, shot, config)), *config.focus_distance_m))
-    excess = np.float32(focus_m) / depth_m - 1
+    excess = np.float32(focus_m) / crop.depth_m - 1
     most = float(np.quantile(np.abs(excess), MOSTLY))
     k_cam_px = max(config.k_cam_px[0], min(shot.k_cam_px, config.defocus_px[1] / max(most, 1e-6)))
-    layers, _ = sliced(light, -excess * np.float32(k_cam_px))
-    gamma_px = max(shot.gamma_px, softest_gamma_px(softness))
+    layers, _ = sliced(crop.light, -excess * np.float32(k_cam_px))
     shot = replace(
-        shot, k_cam_px=k_cam_px, gamma_px=gamma_px, focus_distance_m=focus_m, focal_length_px=focal_length_px, side=0
+        shot,
+        k_cam_px=k_cam_px,
+        gamma_px=max(shot.gamma_px, softest_gamma_px(crop.softness)),
+        focus_distance_m=focus_m,
+        focal_length_px=crop.focal_length_px,
+        side=0,
     )
     found = (torch.stack([layer.defocus_px for layer in layers]).numpy() / -k_cam_px).astype(np.float32)
-    return shot, layers, found, softness
+    return Scene(shot, layers, found, crop.softness)
 
 
 def draw_sample(seed: int, config: SceneConfig, material: Material = NOTHING) -> Sample:
@@ -369,10 +382,16 @@ def draw_sample(seed: int, config: SceneConfig, material: Material = NOTHING) ->
     rng = np.random.default_rng(seed)
     shot = draw_shot(rng, config)
     if material.frames and rng.random() < config.frame_share:
-        shot, layers, excesses, softness = _frame_layers(rng, shot, config, draw_frame(rng, material.frames))
-        return Sample(*_photograph(rng, shot, config, layers, excesses, softness), shot)
-    if rng.random() >= RESCALED_SHARE:
-        return Sample(*_photograph(rng, shot, config, *draw_layers(rng, shot, config, material.photographs)), shot)
+        return _photograph(rng, _framed_scene(rng, shot, config, draw_frame(rng, material.frames)), config)
+    if rng.random() < RESCALED_SHARE:
+        return _taken_larger(rng, shot, config, material.photographs)
+    return _photograph(rng, _drawn_scene(rng, shot, config, material.photographs), config)
+
+
+def _taken_larger(
+    rng: np.random.Generator, shot: Shot, config: SceneConfig, photographs: list[NDArray[np.uint8]]
+) -> Sample:
+    """A shot whose picture was larger, and made small: gamma, which that makes less, is what is left of it."""
     size = config.size_px
     larger_px = round(size * rng.uniform(*RESCALES))
     ratio = larger_px / size
@@ -389,9 +408,9 @@ def draw_sample(seed: int, config: SceneConfig, material: Material = NOTHING) ->
         gamma_px=thin_lens.gamma_before_averaging(shot.gamma_px, larger_px, size),
         focal_length_px=shot.focal_length_px * ratio,
     )
-    image, excess = _photograph(rng, taken, larger, *draw_layers(rng, taken, larger, material.photographs))
-    small = cv2.resize(image.transpose(1, 2, 0), (size, size), interpolation=cv2.INTER_AREA)
-    told = cv2.resize(excess.astype(np.float32), (size, size), interpolation=cv2.INTER_NEAREST_EXACT)
+    sample = _photograph(rng, _drawn_scene(rng, taken, larger, photographs), larger)
+    small = cv2.resize(sample.image.transpose(1, 2, 0), (size, size), interpolation=cv2.INTER_AREA)
+    told = cv2.resize(sample.excess.astype(np.float32), (size, size), interpolation=cv2.INTER_NEAREST_EXACT)
     pixels = np.ascontiguousarray(np.asarray(small, np.uint8).transpose(2, 0, 1))
     gamma_px = thin_lens.gamma_after_averaging(taken.gamma_px, larger_px, size)
     return Sample(pixels, np.asarray(told, np.float16), replace(shot, gamma_px=gamma_px))
@@ -400,33 +419,28 @@ def draw_sample(seed: int, config: SceneConfig, material: Material = NOTHING) ->
 def draw_negative(seed: int, config: SceneConfig, material: Material = NOTHING) -> Negative:
     """The surfaces of this seed, before any lens; the same seed, config and material give the same."""
     rng = np.random.default_rng(seed)
-    shot, softness = draw_shot(rng, config), 0.0
+    shot = draw_shot(rng, config)
     if material.frames and rng.random() < config.frame_share:
-        shot, layers, excesses, softness = _frame_layers(rng, shot, config, draw_frame(rng, material.frames))
+        scene = _framed_scene(rng, shot, config, draw_frame(rng, material.frames))
     else:
-        layers, excesses = draw_layers(rng, shot, config, material.photographs)
-    parts = zip(layers, torch.from_numpy(excesses), strict=True)
+        scene = _drawn_scene(rng, shot, config, material.photographs)
+    parts = zip(scene.layers, torch.from_numpy(scene.excesses), strict=True)
     surfaces = torch.stack([torch.cat([layer.color, layer.alpha, excess[None]]) for layer, excess in parts])
-    return Negative(surfaces.half(), np.stack([excesses.min((1, 2)), excesses.max((1, 2))]), shot, softness)
+    ends = np.stack([scene.excesses.min((1, 2)), scene.excesses.max((1, 2))])
+    return Negative(surfaces.half(), ends, scene.shot, scene.softness)
 
 
-def _photograph(
-    rng: np.random.Generator,
-    shot: Shot,
-    config: SceneConfig,
-    layers: list[Layer],
-    excesses: Map,
-    softness: float = 0.0,
-) -> tuple[NDArray[np.uint8], NDArray[np.float16]]:
-    """Picture uint8 [3,h,w] and q - 1 [h,w] of surfaces, nearest first, taken so."""
-    linear, front = render_layers(layers, shot.spread)
-    seen = np.take_along_axis(excesses, front.numpy()[None], 0)[0]
+def _photograph(rng: np.random.Generator, scene: Scene, config: SceneConfig) -> Sample:
+    """The scene's picture, and what most of each of its pixels' light comes from."""
+    linear, front = render_layers(scene.layers, scene.shot.spread)
+    seen = np.take_along_axis(scene.excesses, front.numpy()[None], 0)[0]
     sharpening = Sharpening.draw(rng)
-    rest_px, through_mosaic = rest_of_gamma(rng, shot.gamma_px, softness, sharpening)
+    rest_px, through_mosaic = rest_of_gamma(rng, scene.shot.gamma_px, scene.softness, sharpening)
     inner = slice(config.margin_px, config.margin_px + config.size_px)
     light = np.ascontiguousarray(blur(linear, rest_px)[:, inner, inner].permute(1, 2, 0).numpy())
     pixels = develop(rng, light, config, sharpening, through_mosaic=through_mosaic)
-    return np.ascontiguousarray(pixels.transpose(2, 0, 1)), seen[inner, inner].astype(np.float16)
+    image = np.ascontiguousarray(pixels.transpose(2, 0, 1))
+    return Sample(image, seen[inner, inner].astype(np.float16), scene.shot)
 
 
 def true_blur_px(sample: Sample) -> Map:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from model_export.config import SceneConfig
-from model_export.frames import Frame, draw_frame, draw_view
+from model_export.frames import Frame, draw_crop, draw_frame
 from model_export.render import sliced
 from model_export.scenes import Material, draw_sample, true_blur_px
 
@@ -26,16 +26,17 @@ def test_a_view_shows_what_it_says_the_depth_of(size: int) -> None:
     shown = np.where(frame().depth_m > 2, 200, 20).astype(np.uint8)
     dark_left = replace(frame(), image=shown[..., None].repeat(3, 2))
     for seed in range(20):
-        light, depth_m, focal_length_px, _ = draw_view(np.random.default_rng(seed), dark_left, size)
+        crop = draw_crop(np.random.default_rng(seed), dark_left, size)
+        light, depth_m = crop.light, crop.depth_m
         assert light.shape == (size, size, 3)
-        assert 0.65 * 130 <= focal_length_px <= 130
+        assert 0.65 * 130 <= crop.focal_length_px <= 130
         dark = light[..., 1] < light[..., 1].max() / 4 if np.ptp(depth_m) > 0 else depth_m < 2
         assert (dark == (depth_m < 2)).mean() > 0.97  # all but the edge
 
 
 def test_a_frame_is_not_made_smaller_than_a_window_of_it() -> None:
     """At 0.65 of its size this one is 78 pixels high."""
-    grown = [draw_view(np.random.default_rng(seed), frame(), 114)[2] / 130 for seed in range(20)]
+    grown = [draw_crop(np.random.default_rng(seed), frame(), 114).focal_length_px / 130 for seed in range(20)]
     assert min(grown) >= 0.95
     assert max(grown) > 0.98
 
