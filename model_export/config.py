@@ -35,10 +35,7 @@ class SceneConfig:
     """What the procedural scenes span, in ranges (low, high) that the manifest states, and what they are mixed of.
 
     As it is here they are what models are scored on, which stays, so that scores compare; training has a mixture of
-    its own (``MIXTURE``). Of all scenes ``frame_share`` are frames where there are some, of the others ``wall_share``
-    nothing but a wall and ``room_share`` rooms, of the rest ``layered_share`` have up to ``max_layers`` surfaces, of
-    which ``close_share`` are near each other in depth. Noise is alike in all colours in ``grey_share`` of the pictures
-    that show no mosaic, and ``clean_share`` have none.
+    its own (``MIXTURE``).
     """
 
     size_px: Annotated[int, Field(ge=16, multiple_of=16)] = 192
@@ -50,14 +47,14 @@ class SceneConfig:
     defocus_px: Span = (0.4, 20.0)
     depth_ratio: Span = (0.15, 8.0)
     jpeg_quality: tuple[Quality, Quality] = (60, 98)
-    frame_share: Share = 0.5
-    wall_share: Share = 0.2
-    room_share: Share = 0.5
-    layered_share: Share = 0.7
+    frame_share: Share = 0.5  # frames, where there are some; the others are drawn:
+    wall_share: Share = 0.2  # of them nothing but a wall
+    room_share: Share = 0.5  # of them rooms
+    layered_share: Share = 0.7  # of the rest up to ``max_layers`` surfaces, and not one alone
     max_layers: Count = 6
-    close_share: Share = 0.5
-    grey_share: Share = 0.0
-    clean_share: Share = 0.0
+    close_share: Share = 0.5  # of these near each other in depth
+    grey_share: Share = 0.0  # noise alike in all colours, of the pictures that show no mosaic
+    clean_share: Share = 0.0  # no noise, of all pictures
 
 
 # depth differs more within a picture than in those that are scored: of such a mixture networks learn outlines
@@ -74,18 +71,7 @@ MIXTURE = SceneConfig(
 
 @dataclass(frozen=True, slots=True)
 class TrainConfig:
-    """A training run: ``steps`` batches, drawn from a pool that ``fresh_per_step`` new scenes flow through.
-
-    The last ``settled_share`` of the steps has the batch norms' statistics fixed, as the exported network has: all of
-    them in a run that begins with weights, decoders' too. A ``taught`` run learns teachers' answers too, the side of
-    focus among them where ``side_weight`` is 0 or the layout is what is learned, of two of four mirror images or of
-    ``all_mirrors``; ``teacher_shares`` are each one's in the side, and in all else, alike if there are none.
-    ``learning`` is what moves: all or the depth network alone, either without what tells the side by the layout, or
-    that alone. Of the pictures ``turned_share`` do not stay upright, for ``hint_share`` a side is asked for;
-    ``faded_share`` lose contrast and ``dimmed_share`` light before what learns, but no teacher, sees them. Of the steps
-    ``large_share`` have a quarter as many, twice as large. With ``retaken`` the pool holds scenes, not pictures: each
-    batch takes pictures of its own of them, where steps are computed (``darkroom.py``).
-    """
+    """A training run: ``steps`` batches, drawn from a pool that ``fresh_per_step`` new scenes flow through."""
 
     kind: Kind = "compact"
     seed: Annotated[int, Field(ge=0, le=MOST_SEED)] = 1
@@ -94,24 +80,29 @@ class TrainConfig:
     learning_rate: Positive = 1e-3
     weight_decay: Weight = 1e-4
     warmup_steps: Count = 200
-    decay_share: Share = 0.5
+    decay_share: Share = 0.5  # of the steps, the last ones: the rate falls to nothing
     clip_norm: Positive = 1.0
-    b_weight: Weight = 1.0
+    b_weight: Weight = 1.0  # of L_blur (eq. 8)
     side_weight: Weight = 0.3
+    # teachers' answers are learned too, the side among them where ``side_weight`` is 0 or the layout is what is learned
     taught: bool = False
-    all_mirrors: bool = False
-    teacher_shares: tuple[tuple[Weight, Weight], ...] = ()
+    all_mirrors: bool = False  # teachers answer all four mirror images of a picture, or two
+    teacher_shares: tuple[tuple[Weight, Weight], ...] = ()  # each one's in the side, and in all else; none: alike
+    # all or the depth network alone move, either without what tells the side by the layout, or that alone
     learning: Learning = "all"
     likeness_weight: Weight = 10.0
     pool: Count = 600
     fresh_per_step: Weight = 1.0
+    # the pool holds scenes, not pictures: each batch takes its own of them, where steps are computed (``darkroom.py``)
     retaken: bool = False
-    turned_share: Share = 0.3
-    hint_share: Share = 0.5
-    large_share: Share = 0.0
-    faded_share: Share = 0.0
-    dimmed_share: Share = 0.0
+    turned_share: Share = 0.3  # of the pictures: not upright
+    hint_share: Share = 0.5  # of the pictures: a side is asked for
+    large_share: Share = 0.0  # of the steps: a quarter as many pictures, twice as large
+    faded_share: Share = 0.0  # of the pictures: less contrast, for what learns and for no teacher
+    dimmed_share: Share = 0.0  # of the pictures: less light, likewise
     checkpoint_every: Count = 250
+    # of the steps, the last ones: batch norms' statistics are fixed, as in the exported network; all of them in a run
+    # that begins with weights, decoders' too
     settled_share: Share = 0.35
     settle_batches: Count = 60
     scenes: SceneConfig = MIXTURE

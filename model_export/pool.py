@@ -172,14 +172,14 @@ def collate(samples: list[Sample], rng: np.random.Generator, config: TrainConfig
     Most are left upright: below is nearer, as in most photographs. A side is asked for at times, of scenes on both
     sides either: a near thing may stand before a far background.
     """
-    images, excesses, rows = [], [], []
+    images, excesses, told = [], [], []
     for sample in samples:
         turns, flip = _turn(rng, config)
         images.append(np.rot90(sample.image, turns, (1, 2))[:, :, ::flip].copy())
         excesses.append(np.rot90(sample.excess, turns)[:, ::flip].astype(np.float32))
-        rows.append(_told(rng, sample.shot, config))
+        told.append(_told(rng, sample.shot, config))
     image = torch.from_numpy(np.stack(images)).float() / 255
-    return _batch(rng, config, image, torch.from_numpy(np.stack(excesses))[:, None], rows)
+    return _batch(rng, config, image, torch.from_numpy(np.stack(excesses))[:, None], told)
 
 
 def collate_retaken(
@@ -203,13 +203,21 @@ def _turn(rng: np.random.Generator, config: TrainConfig) -> tuple[int, int]:
     return int(rng.integers(4)) if rng.random() < config.turned_share else 0, int(rng.choice([-1, 1]))
 
 
-def _told(rng: np.random.Generator, shot: Shot, config: TrainConfig) -> tuple[float, ...]:
-    """A shot as a batch has it: numbers of its camera, the gamma told, the side, what is left of contrast and light."""
+def _told(rng: np.random.Generator, shot: Shot, config: TrainConfig) -> dict[str, float]:
+    """A shot as a batch has it, by the names there: what of its camera is known, guessed or asked for, and its wear."""
     focal = 0.0 if rng.random() < FOCAL_UNKNOWN_SHARE else shot.focal_length_px
     side = (shot.side or int(rng.choice([-1, 1]))) if rng.random() < config.hint_share else 0
     guess = math.exp(rng.normal(*GUESSED_GAMMA)) if rng.random() < GUESSED_GAMMA_SHARE else 1.0
-    worn = _left(rng, config.faded_share, LEAST_CONTRAST), _left(rng, config.dimmed_share, LEAST_LIGHT)
-    return (shot.k_cam_px, shot.gamma_px, guess * shot.gamma_px, shot.focus_distance_m, focal, side, *worn)
+    return {
+        "k_cam_px": shot.k_cam_px,
+        "gamma_px": shot.gamma_px,
+        "told_gamma_px": guess * shot.gamma_px,
+        "focus_distance_m": shot.focus_distance_m,
+        "focal_length_px": focal,
+        "side": side,
+        "contrast": _left(rng, config.faded_share, LEAST_CONTRAST),
+        "light": _left(rng, config.dimmed_share, LEAST_LIGHT),
+    }
 
 
 def _left(rng: np.random.Generator, share: float, least: float) -> float:
@@ -218,14 +226,15 @@ def _left(rng: np.random.Generator, share: float, least: float) -> float:
 
 
 def _batch(
-    rng: np.random.Generator, config: TrainConfig, image: Tensor, excess: Tensor, rows: Sequence[tuple[float, ...]]
+    rng: np.random.Generator, config: TrainConfig, image: Tensor, excess: Tensor, told: Sequence[dict[str, float]]
 ) -> Batch:
-    columns = sent(torch.tensor(rows, dtype=torch.float32), image.device).unbind(1)
+    numbers = torch.tensor([[*each.values()] for each in told], dtype=torch.float32)
+    columns = dict(zip(told[0], sent(numbers, image.device).unbind(1), strict=True))
     place = (rng.random(), rng.random())
     mirrors: tuple[Mirror, ...] = UPRIGHT + UPSIDE_DOWN
     if not config.all_mirrors:  # on two cores all four cost teachers more than the step itself
         mirrors = (UPRIGHT[rng.integers(2)], UPSIDE_DOWN[rng.integers(2)])
-    return Batch(image.contiguous(memory_format=torch.channels_last), excess, *columns, place=place, mirrors=mirrors)
+    return Batch(image.contiguous(memory_format=torch.channels_last), excess, **columns, place=place, mirrors=mirrors)
 
 
 def held_out(scenes: SceneConfig, material: Material, numbers: Iterable[int]) -> Batch:
