@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_export.bench_graphs import THREADS, camera_for, draw_picture
-from model_export.evaluation_sets import to_pixels
+from model_export.cases import to_pixels
 from model_export.render import refocus
 from service.inference.artifact import load_model_folder
 from service.inference.estimator import Estimator

@@ -200,7 +200,7 @@ def export(
     with _training_parts():
         from model_export.corrections import ALL_SCENES, record_corrections, unseen_cases
         from model_export.export import export_checkpoint
-        from model_export.quantized import quantised_graphs
+        from model_export.quantised import quantised_graphs
 
     pictures = [folder for folder in (textures, frames) if folder is not None]
     # what breaks off leaves no folder that serves, without its corrections
@@ -264,7 +264,7 @@ def evaluate(
 ) -> None:
     """Score a model on pictures that no training saw, beside the best constant depth of each picture."""
     with _training_parts():
-        from model_export import report as reports
+        from model_export import tables
         from model_export.evaluate import evaluate as run_evaluation
         from model_export.evaluation_sets import FOLDERS, evaluation_sets
 
@@ -285,10 +285,10 @@ def evaluate(
         )
     if empty := {each.name for each in sets} - {found_of.name for found_of in found[0].sets}:
         typer.secho(f"no picture with enough depth to score: without {', '.join(sorted(empty))}", err=True)
-    tables = reports.tables(found[0])
+    shown = tables.tables(found[0])
     if beside is not None:
-        tables |= {f"{found[1].model} beside {found[0].model}": reports.beside(*found)}
-    for title, (head, rows) in tables.items():
+        shown |= {f"{found[1].model} beside {found[0].model}": tables.beside(*found)}
+    for title, (head, rows) in shown.items():
         print_table(_as_table(title, head, rows))
     with _plain_failures():
         _keep(found, out, models if update_card else [], "camind evaluate --data DATA" + " --quick" * quick)
@@ -297,7 +297,8 @@ def evaluate(
 def _keep(found: "list[Report]", out: Path | None, models: list[Path], command: str) -> None:
     """Write reports into a folder, and what they found into the cards of models."""
     from model_export.card import record_scores
-    from model_export.report import markdown, write
+    from model_export.report_page import write
+    from model_export.tables import markdown
 
     if out is not None:
         for report, folder in zip(found, (out, out / "beside"), strict=False):

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from model_export.cases import PROCEDURAL_SIDES, Case, procedural_cases
 from model_export.evaluate import Examiner
-from model_export.evaluation_sets import PROCEDURAL_SIDES, Case, procedural_cases
 from model_export.summary import Pixels
 from service.inference.artifact import Manifest, load_model_folder, write_manifest
 

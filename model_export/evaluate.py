@@ -15,8 +15,9 @@ from queue import Queue
 import numpy as np
 from numpy.typing import NDArray
 
+from model_export.cases import Case, Map
 from model_export.devices import one_core
-from model_export.evaluation_sets import Case, EvaluationSet, Map
+from model_export.evaluation_sets import EvaluationSet
 from model_export.metrics import Scores, best_constant, completed, mean_scores, score
 from model_export.modes import (
     KNOWN_DEPTHS,

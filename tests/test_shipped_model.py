@@ -14,9 +14,10 @@ import pytest
 from numpy.typing import NDArray
 
 from model_export import textures
+from model_export.cases import fixed_cases, is_textured
 from model_export.config import SceneConfig
 from model_export.evaluate import Examiner
-from model_export.evaluation_sets import FIXED, fixed_cases, is_textured
+from model_export.evaluation_sets import FIXED
 from model_export.render import refocus
 from model_export.started_server import Server, serving
 from model_export.summary import summarise

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from model_export.cases import photographed_cases
 from model_export.datasets.blender import (
     EDGE_TOLERANCE,
     GAMMA_PX,
@@ -21,7 +22,6 @@ from model_export.datasets.blender import (
     sharp_edge,
 )
 from model_export.datasets.blender_environment import environment, shares
-from model_export.evaluation_sets import photographed_cases
 from service.cores import available_cores
 from service.optics import thin_lens
 from service.optics.light import decode_srgb

@@ -10,9 +10,10 @@ import OpenEXR
 import pytest
 from typer.testing import CliRunner
 
+from model_export.cases import REFERENCE, photographed_cases, refocused_cases
 from model_export.cli import commands
 from model_export.datasets.photos import Photo, load_photos, save_photos
-from model_export.evaluation_sets import REFERENCE, evaluation_sets, photographed_cases, refocused_cases
+from model_export.evaluation_sets import evaluation_sets
 from service.optics import thin_lens
 
 PICTURE = np.random.default_rng(1).integers(0, 256, (48, 64, 3), np.uint8)

@@ -13,25 +13,24 @@ import pytest
 from typer.testing import CliRunner
 
 from model_export.calibrated import calibrated
-from model_export.cli import commands
-from model_export.corrections import blur_gain, record_corrections, temperature, unseen_cases
-from model_export.evaluate import Examiner, evaluate
-from model_export.evaluation_sets import (
-    ORACLE_FACTORS,
+from model_export.cases import (
     REFERENCE,
     Case,
-    EvaluationSet,
     d200_cases,
     enlarged_cases,
-    evaluation_sets,
     procedural_cases,
     sharp_cases,
     shuffled_cases,
     viewed_cases,
 )
+from model_export.cli import commands
+from model_export.corrections import blur_gain, record_corrections, temperature, unseen_cases
+from model_export.evaluate import Examiner, evaluate
+from model_export.evaluation_sets import ORACLE_FACTORS, EvaluationSet, evaluation_sets
 from model_export.modes import ESTIMATED_K_CAM, MODES, RIGHT_SIDE, UNSEEN_K_CAM_PX
-from model_export.report import beside, tables, write
+from model_export.report_page import write
 from model_export.summary import EQUAL_BLUR_PX, Pixels, Relief, Report, Sides, blur_ranges, summarise
+from model_export.tables import beside, tables
 from service.inference.artifact import Interval, load_model_folder, write_manifest
 from service.inference.hypotheses import in_metres
 from service.inference.pair import Side

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from model_export import quantized
+from model_export import quantised
 from model_export.card import record_scores
 from model_export.cli import commands
 from model_export.config import Kind, SceneConfig, TrainConfig
@@ -66,8 +66,8 @@ def exported(request: pytest.FixtureRequest) -> tuple[Pair, Path]:
 def in_int8(compact: tuple[Pair, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[Pair, Path]:
     (pair, floating), folder = compact, tmp_path_factory.mktemp("int8")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(quantized, "SCENES", CALIBRATED_ON)
-        in_int8 = partial(quantized.quantised_graphs, floating=floating)
+        patch.setattr(quantised, "SCENES", CALIBRATED_ON)
+        in_int8 = partial(quantised.quantised_graphs, floating=floating)
         export_pair(pair, TrainConfig(), 0, folder, write_graphs=in_int8)
     return pair, folder
 
@@ -115,7 +115,7 @@ def test_in_int8_scenes_are_seen_on_average_as_in_float32(in_int8: tuple[Pair, P
     pair, graph = in_int8[0], load_model_folder(in_int8[1]).blur_graph
     off = []
     for number in range(CALIBRATED_ON):
-        scene = draw_sample(quantized.FIRST_SEED + number, SceneConfig()).image[np.newaxis]
+        scene = draw_sample(quantised.FIRST_SEED + number, SceneConfig()).image[np.newaxis]
         seen, expected = features_seen(pair, graph, torch.from_numpy(scene).float() / 255)
         off.append((seen - expected).mean((0, 2, 3)))
     steps = np.mean(off, axis=0) / constant(graph, "features_scale")
@@ -161,7 +161,7 @@ def test_graphs_name_no_file_of_the_machine_that_made_them(
         for graph in folder.glob("*.onnx"):
             content = graph.read_bytes()
             assert b'File "' not in content
-            assert str(Path(quantized.__file__).parents[1]).encode() not in content
+            assert str(Path(quantised.__file__).parents[1]).encode() not in content
 
 
 def test_the_card_carries_ranges_licences_and_then_scores(exported: tuple[Pair, Path]) -> None:
