@@ -1,18 +1,15 @@
 """``POST /calibrate`` and ``/calibrations``: photographs of the printed grid in, a camera's constants out."""
 
 import asyncio
-import hashlib
-import json
-from collections import Counter
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from contextlib import suppress
 from typing import Annotated
-from uuid import uuid4
 
 from fastapi import APIRouter, Depends, FastAPI, Header, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
+from service.api.calibration_intake import IntakeDep
 from service.api.calibration_schemas import (
     SETTINGS_FIELD,
     Acceptance,
@@ -21,15 +18,13 @@ from service.api.calibration_schemas import (
     CalibrationRead,
     CalibrationSettings,
 )
-from service.api.calibration_uploads import DEFOCUSED, FOCUSED, FormLimits, receive_form
+from service.api.calibration_uploads import DEFOCUSED, FOCUSED
 from service.api.cursors import Cursor, Limit, cursor_after, name_of
 from service.api.dependencies import (
     CalibrationsDep,
     FollowersDep,
     IdempotencyKey,
-    OwnerDep,
     RunnerDep,
-    SettingsDep,
     SpoolDep,
     count_follower,
     require_json,
@@ -51,15 +46,11 @@ from service.errors import (
     UnsupportedKind,
 )
 from service.inference.images import MEDIA_TYPES
-from service.principal import Principal
 from service.runner import RESULT
-from service.storage.calibrations import ID_PATTERN, CalibrationDraft, CalibrationRecord, Calibrations
-from service.storage.idempotency import once_of
+from service.storage.calibrations import ID_PATTERN, CalibrationRecord, Calibrations
 from service.storage.keys import Keys
-from service.storage.spool import Spool
 
 LOOK_S = 0.2
-RETRY_AFTER_S = 30
 HEADERS = {
     "Location": {"description": "The calibration's path", "schema": {"type": "string"}},
     "Preference-Applied": {"description": "The wait that was granted", "schema": {"type": "string"}},
@@ -123,11 +114,8 @@ async def create_calibration(
     request: Request,
     response: Response,
     camera: Annotated[Name, Query(description="The camera it is for; it need not be there yet")],
-    settings: SettingsDep,
-    calibrations: CalibrationsDep,
-    spool: SpoolDep,
+    intake: IntakeDep,
     runner: RunnerDep,
-    owner: OwnerDep,
     followers: FollowersDep,
     prefer: Annotated[
         str | None, Header(description=f"`wait=SECONDS`, at most {MOST_WAIT_S}: answer when it has ended")
@@ -135,16 +123,13 @@ async def create_calibration(
     idempotency_key: IdempotencyKey = None,
 ) -> CalibrationRead:
     """Queue a calibration. It is worked on one at a time, survives a restart, and its photographs go when it ends."""
-    principal: Principal = request.state.principal
-    await _require_room(calibrations, spool, settings.calibration_queue_size, principal.sharer, idempotency_key)
-    limits = FormLimits(settings.max_calibration_images, settings.max_image_bytes, settings.max_json_bytes)
-    record = await _received(request, camera, limits, calibrations, spool, owner, idempotency_key)
+    record = await intake.receive(request, camera, idempotency_key)
     runner.wake()
     response.headers["Location"] = f"/calibrations/{record.id}"
     wait_s = wait_of(prefer)
     if wait_s is not None:
-        with suppress(Busy), followers.counted(owner):
-            record = await _waited(request.app, calibrations, record, wait_s)
+        with suppress(Busy), followers.counted(intake.principal.owner):
+            record = await _waited(request.app, intake.calibrations, record, wait_s)
             response.headers["Preference-Applied"] = f"wait={wait_s}"
             response.status_code = 200 if record.has_ended else 202
     return CalibrationRead.model_validate(record)
@@ -250,57 +235,6 @@ def cancel_calibration(
     if calibrations.cancel(calibration_id) == "queued":
         spool.remove(calibration_id)
     runner.wake()
-
-
-async def _require_room(
-    calibrations: Calibrations, spool: Spool, queue_size: int, sharer: str | None, idempotency_key: str | None
-) -> None:
-    """What was done before will not wait once more, but its photographs arrive like others."""
-    is_repeated = idempotency_key is not None and await run_in_threadpool(calibrations.has_done, idempotency_key)
-    waiting = Counter[str]() if is_repeated else await run_in_threadpool(calibrations.waiting, spool.id)
-    held = waiting + spool.incoming
-    own = held[sharer] if sharer is not None else 0
-    if held.total() + own >= queue_size:
-        whose = f", {own} of them this owner's" if own else ""
-        detail = f"{held.total()} calibrations wait already{whose}: try again later."
-        raise Busy(detail, retry_after_s=RETRY_AFTER_S)
-
-
-async def _received(
-    request: Request,
-    camera: str,
-    limits: FormLimits,
-    calibrations: Calibrations,
-    spool: Spool,
-    owner: str,
-    idempotency_key: str | None,
-) -> CalibrationRecord:
-    """The calibration in a request's form, with its photographs on the disk and its row in the database."""
-    calibration_id = uuid4().hex
-    with spool.receiving(calibration_id, owner) as folder:
-        form = await receive_form(request, folder, limits)
-        wanted = CalibrationSettings.from_form(form.settings)
-        draft = CalibrationDraft(calibration_id, spool.id, camera, wanted.model_dump(mode="json"), form.pictures)
-        return await run_in_threadpool(_store, calibrations, spool, draft, idempotency_key)
-
-
-def _store(
-    calibrations: Calibrations, spool: Spool, draft: CalibrationDraft, idempotency_key: str | None
-) -> CalibrationRecord:
-    spool.seal(draft.id)
-    record = calibrations.add(draft, once_of(idempotency_key, _parts(draft, spool)))
-    if record.id != draft.id:  # the request was done before, and these are its photographs once more
-        spool.remove(draft.id)
-    return record
-
-
-def _parts(draft: CalibrationDraft, spool: Spool) -> Iterator[bytes]:
-    """All that makes a request for a calibration what it is."""
-    yield json.dumps([draft.camera, draft.settings]).encode()
-    for picture, path in zip(draft.pictures, spool.paths(draft.id, len(draft.pictures)), strict=True):
-        yield f"{picture.role} {picture.name}".encode()
-        with path.open("rb") as file:
-            yield hashlib.file_digest(file, "sha256").digest()
 
 
 async def _changes(
