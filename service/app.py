@@ -21,7 +21,7 @@ from service.api import (
     metrics,
     model,
     openapi,
-    pages,
+    page,
     photographs,
     target,
 )
@@ -98,7 +98,7 @@ def create_app(settings: Settings, calibrate: Calibrate = calibrate) -> FastAPI:
         app.include_router(
             part.router, dependencies=[Depends(require_known_parameters)], responses=responses(BadRequest)
         )
-    for part in (model, health, metrics, pages):
+    for part in (model, health, metrics, page):
         app.include_router(part.router)
     # FastAPI's own way to another description: https://fastapi.tiangolo.com/how-to/extending-openapi/
     replaceable: Any = app

@@ -350,8 +350,8 @@ def add_camera(
 
     from pydantic import ValidationError
 
+    from service.api.camera_schemas import CameraCreate
     from service.api.problems import invalid_model
-    from service.api.schemas import CameraCreate
     from service.storage.cameras import Cameras
 
     with _plain_failures():
@@ -385,7 +385,7 @@ def _stored(cameras: "Cameras", draft: "CameraDraft", *, replace: bool) -> "Came
 @cameras_app.command(name="show")
 def show_camera(name: CameraName, owner: Owner = LOCAL) -> None:
     """Print a camera as the JSON that add takes."""
-    from service.api.schemas import CameraCreate
+    from service.api.camera_schemas import CameraCreate
 
     with _ready_engine() as engine:
         record = _camera(engine, owner, name)

@@ -22,7 +22,7 @@ from sqlmodel import col
 from typer.testing import CliRunner, Result
 
 from service import cli, server
-from service.api.schemas import LENS_EXAMPLE
+from service.api.camera_schemas import LENS_EXAMPLE
 from service.config import Settings
 from service.storage import schema
 from service.storage.calibrations import CalibrationDraft, Calibrations

@@ -6,9 +6,9 @@ from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
 
+from service.api.camera_schemas import FocusDistance, Given, IntrinsicsRead, Name
 from service.api.cursors import NextCursor
 from service.api.problems import invalid_request
-from service.api.schemas import FocusDistance, Given, IntrinsicsRead, Name
 from service.calibration.report import Exposure, Look, Method, Role, Shape
 from service.calibration.target import CircleGrid, Kind
 from service.errors import BadRequest

@@ -19,6 +19,7 @@ from service.api.calibration_schemas import (
     CalibrationSettings,
 )
 from service.api.calibration_uploads import DEFOCUSED, FOCUSED
+from service.api.camera_schemas import Name
 from service.api.cursors import Cursor, Limit, cursor_after, name_of
 from service.api.dependencies import (
     CalibrationsDep,
@@ -32,7 +33,6 @@ from service.api.dependencies import (
 from service.api.openapi import REF
 from service.api.preferences import MOST_WAIT_S, wait_of
 from service.api.problems import STORE_ERRORS, WRITE_ERRORS, responses
-from service.api.schemas import Name
 from service.api.uploads import BINARY, MULTIPART
 from service.errors import (
     BadRequest,
@@ -45,7 +45,7 @@ from service.errors import (
     TooLarge,
     UnsupportedKind,
 )
-from service.inference.images import MEDIA_TYPES
+from service.inference.images import PHOTOGRAPH_TYPES
 from service.runner import RESULT
 from service.storage.calibrations import ID_PATTERN, CalibrationRecord, Calibrations
 from service.storage.keys import Keys
@@ -103,7 +103,7 @@ FoundDep = Annotated[CalibrationRecord, Depends(_find)]
                     },
                     "encoding": {
                         SETTINGS_FIELD: {"contentType": "application/json"},
-                        **{role: {"contentType": ", ".join(MEDIA_TYPES)} for role in (FOCUSED, DEFOCUSED)},
+                        **{role: {"contentType": ", ".join(PHOTOGRAPH_TYPES)} for role in (FOCUSED, DEFOCUSED)},
                     },
                 }
             },

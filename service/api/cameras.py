@@ -7,10 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
-from service.api.cursors import Cursor, Limit, cursor_after, name_of
-from service.api.dependencies import CamerasDep, IdempotencyKey, require_json
-from service.api.problems import STORE_ERRORS, WRITE_ERRORS, responses
-from service.api.schemas import (
+from service.api.camera_schemas import (
     CameraCreate,
     CameraDraftRead,
     CameraPage,
@@ -21,6 +18,9 @@ from service.api.schemas import (
     PreviewRead,
     RevisionPage,
 )
+from service.api.cursors import Cursor, Limit, cursor_after, name_of
+from service.api.dependencies import CamerasDep, IdempotencyKey, require_json
+from service.api.problems import STORE_ERRORS, WRITE_ERRORS, responses
 from service.api.uploads import REQUEST_BODY, receive_photograph
 from service.errors import (
     BadRequest,

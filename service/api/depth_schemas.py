@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema
 
-from service.api.schemas import FocusDistance
+from service.api.camera_schemas import FocusDistance
 from service.api.texts import Worded, numbers_in
 from service.inference.encode import MAPS, MapName
 from service.inference.known import KnownDepth

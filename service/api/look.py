@@ -6,10 +6,10 @@ from fastapi import APIRouter, Query, Request
 from fastapi.concurrency import run_in_threadpool
 
 from service.api.calibration_schemas import LookRead
+from service.api.camera_schemas import Name
 from service.api.clients import unless_gone
 from service.api.dependencies import CamerasDep, SettingsDep, SharerDep, WorkerDep
 from service.api.problems import responses
-from service.api.schemas import Name
 from service.api.target import GridDep
 from service.api.uploads import REQUEST_BODY, receive_photograph
 from service.calibration.target import CircleGrid

@@ -14,7 +14,7 @@ from starlette.datastructures import UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 
 from service.errors import BadRequest, Busy
-from service.inference.images import MEDIA_TYPES, declared_kind
+from service.inference.images import PHOTOGRAPH_TYPES, declared_kind
 from service.principal import Principal
 
 FIELD = "image"
@@ -33,9 +33,9 @@ REQUEST_BODY = {
                 "additionalProperties": False,
                 "properties": {FIELD: BINARY},
             },
-            "encoding": {FIELD: {"contentType": ", ".join(MEDIA_TYPES)}},
+            "encoding": {FIELD: {"contentType": ", ".join(PHOTOGRAPH_TYPES)}},
         },
-        **{name: {"schema": BINARY} for name in MEDIA_TYPES},
+        **{name: {"schema": BINARY} for name in PHOTOGRAPH_TYPES},
     },
 }
 

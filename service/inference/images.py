@@ -23,7 +23,7 @@ from service.inference.isolated import decode_isolated
 from service.inference.making import signs_of_making
 from service.opencv import cv2
 
-MEDIA_TYPES: dict[str, Kind] = {
+PHOTOGRAPH_TYPES: dict[str, Kind] = {
     "image/jpeg": "jpeg",
     "image/png": "png",
     "image/tiff": "tiff",
@@ -191,9 +191,9 @@ def declared_kind(media_type: str | None) -> Kind | None:
         return None
     if name == CURL_S_OWN:
         raise UnsupportedKind(f"{name} is what curl says of any body: add -H 'Content-Type: image/jpeg'.")
-    kind = MEDIA_TYPES.get(name) or ALIASES.get(name)
+    kind = PHOTOGRAPH_TYPES.get(name) or ALIASES.get(name)
     if kind is None:
-        raise UnsupportedKind(f"{name[:100]} is not a kind of photograph: send one of {', '.join(MEDIA_TYPES)}.")
+        raise UnsupportedKind(f"{name[:100]} is not a kind of photograph: send one of {', '.join(PHOTOGRAPH_TYPES)}.")
     return kind
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from starlette.testclient import TestClient
 
-from service.api.pages import KINDS, PAGE, WEB
+from service.api.page import KINDS, PAGE, WEB
 from tests.web import pictures
 
 MOST_BYTES = 250_000
