@@ -1,6 +1,6 @@
 """A photograph in, its depth encoded: the work of ``POST /depth`` and of ``camind depth``, all of it in one thread."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -11,6 +11,7 @@ from service.inference.cancellation import Cancellation
 from service.inference.depth_map import DepthMap
 from service.inference.encode import ENCODERS, MAPS, MEDIA_TYPES, Beside, Encoded, pixel_at, read_point, spread_of
 from service.inference.estimator import Estimator
+from service.inference.exif import Exif
 from service.inference.frame import (
     camera_of,
     maybe_another_part,
@@ -77,20 +78,14 @@ def fulfil(cancellation: Cancellation, order: Order, estimator: Estimator) -> An
     for u, v in order.query.points:
         pixel_at(u, v, part)
     known = order.query.known_depths
-    is_refocused = order.query.focus_distance_m is not None
-    taken = taken_otherwise(photograph.exif, camera, is_refocused=is_refocused, is_found=bool(known))
-    registered = order.record.camera
-    specs = (*maybe_of_another_size(registered), *maybe_wrong_specs(order.record.draft.lens, registered))
-    shown = maybe_another_part(photograph.exif, camera)
-    known_at_m = registered.focus_distance_m if registered.intrinsics else None
-    seen = () if PROJECTED.isdisjoint(order.formats) else maybe_seen_otherwise(camera, known_at_m)
     for point in known:
         pixel_at(point.u, point.v, whole, "known")
+    doubts = tuple(_doubts(order, photograph.exif, camera))
     depth_map = estimator.estimate(
         photograph.rgb, camera, order.query.side, cancellation, order.query.part, known, photograph.hidden
     )
     stopwatch.add(depth_map.timings_ms)
-    warnings = (*order.warnings, *photograph.warnings, *taken, *specs, *shown, *seen, *resized, *depth_map.warnings)
+    warnings = (*order.warnings, *photograph.warnings, *doubts, *resized, *depth_map.warnings)
     origin = _origin_of(order, whole, estimator.manifest.name, depth_map.camera, warnings)
     beside = Beside(part.of(photograph.rgb), order.query.maps or MAPS, origin)
     longest_px = order.query.longest_px
@@ -104,6 +99,19 @@ def fulfil(cancellation: Cancellation, order: Order, estimator: Estimator) -> An
         )
     lost = (words for one in encoded for words in one.warnings)
     return Answer(encoded, depth_map.camera, (*warnings, *lost), stopwatch.elapsed_ms)
+
+
+def _doubts(order: Order, exif: Exif, camera: Camera) -> Iterator[str]:
+    """What speaks against the camera that a photograph is said to be by, before any blur is looked at."""
+    registered, query = order.record.camera, order.query
+    is_refocused, is_found = query.focus_distance_m is not None, bool(query.known)
+    yield from taken_otherwise(exif, camera, is_refocused=is_refocused, is_found=is_found)
+    yield from maybe_of_another_size(registered)
+    yield from maybe_wrong_specs(order.record.draft.lens, registered)
+    yield from maybe_another_part(exif, camera)
+    if not PROJECTED.isdisjoint(order.formats):
+        known_at_m = registered.focus_distance_m if registered.intrinsics else None
+        yield from maybe_seen_otherwise(camera, known_at_m)
 
 
 def _as_json(depth_map: DepthMap, order: Order, part: Part, model: str, warnings: tuple[str, ...]) -> Encoded:
