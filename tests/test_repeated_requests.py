@@ -13,7 +13,7 @@ from sqlalchemy import Engine, select, update
 from sqlmodel import col
 from starlette.testclient import TestClient
 
-from service.api.schemas import CameraCreate
+from service.api.camera_schemas import CameraCreate
 from service.app import create_app
 from service.config import Settings
 from service.errors import Conflict, KeyReused
