@@ -16,7 +16,7 @@ from playwright.sync_api import Browser, Dialog, Page, Route, expect
 from model_export.started_server import Server, serving
 from tests.inference.photographs import tiff
 from tests.simulated_sheets import CAMERA, DEPTHS_M, GRID, sheet_photos
-from tests.web.steps import OVERFLOW, eventually, to_photographs
+from tests.web.steps import OVERFLOW, change, eventually, to_photographs
 from tests.web.watched import watched
 
 LONG_MS = 120_000
@@ -370,7 +370,7 @@ def test_a_file_that_is_no_photograph_is_told(
     drop(page, file)
     expect(page.get_by_text("not readable")).to_be_visible()
     expect(page.get_by_role("button", name="Look again")).to_have_count(0)
-    file.write_text("no picture either")
+    change(file, b"no picture either")
     page.get_by_role("button", name="Start the calibration").click()
     expect(page.get_by_text("The browser cannot read notes.jpg.")).to_be_visible()
 

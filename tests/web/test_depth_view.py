@@ -23,7 +23,7 @@ from model_export.started_server import Server, serving
 from service.inference.encode import UNDISTORTING
 from tests.inference import photographs
 from tests.web.chromium import program
-from tests.web.steps import OVERFLOW, eventually
+from tests.web.steps import OVERFLOW, change, eventually
 from tests.web.watched import watched
 
 PHOTOGRAPH = Path(__file__).parents[2] / "docs" / "pictures" / "coffee.jpg"
@@ -724,7 +724,7 @@ def test_a_file_that_was_changed_since_it_was_chosen_is_told(
     choose(opened)
     opened.locator("input[type=file]:not([capture])").first.set_input_files(file)
     stage(opened)
-    file.write_bytes(b"another")
+    change(file, b"another")
     opened.get_by_role("button", name="Download").click()
     expect(opened.get_by_role("alert").filter(visible=True)).to_contain_text("The browser cannot read photo.jpg.")
 
