@@ -100,6 +100,7 @@ class TrainConfig:
     large_share: Share = 0.0  # of the steps: a quarter as many pictures, twice as large
     faded_share: Share = 0.0  # of the pictures: less contrast, for what learns and for no teacher
     dimmed_share: Share = 0.0  # of the pictures: less light, likewise
+    filtered_share: Share = 0.0  # of the pictures: a noise filter's traces, likewise
     checkpoint_every: Count = 250
     # of the steps, the last ones: batch norms' statistics are fixed, as in the exported network; all of them in a run
     # that begins with weights, decoders' too

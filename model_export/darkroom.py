@@ -145,7 +145,7 @@ def render(surfaces: _Surfaces, shots: Sequence[Shot]) -> tuple[Tensor, Tensor]:
     return picture / (1 - clear).clamp_min(1e-3), excess[:, None]
 
 
-def _soften(maps: Tensor, sigma_px: Numbers, radius: int) -> Tensor:
+def soften(maps: Tensor, sigma_px: Numbers, radius: int) -> Tensor:
     """Each of [n,c,h,w] blurred by a Gaussian of its own; what is beyond the border is mirrored."""
     n, c, h, w = maps.shape
     weights = np.exp(-0.5 * (np.arange(-radius, radius + 1) / np.maximum(sigma_px, 0.05)[:, None]) ** 2)
@@ -227,13 +227,13 @@ def develop(
     white = torch.quantile(linear[:, :, ::4, ::4].flatten(1), 0.98, dim=1).clamp_min(0.2)[:, None, None, None]
     picture = linear * exposure / white
     grains = torch.randn(linear.shape, generator=noise, device=device)
-    grains = _soften(torch.where(grey > 0, grains[:, :1], grains), np.where(filtered, spread, 0), 4) * grain
+    grains = soften(torch.where(grey > 0, grains[:, :1], grains), np.where(filtered, spread, 0), 4) * grain
     picture = picture + grains * (shot * picture.clamp_min(0) + read).sqrt()
     picture = torch.where(mosaic > 0, _through_mosaic(picture.clamp(0, 2)), picture)
     picture = picture * sent(rng.uniform(0.85, 1.15, (n, 3, 1, 1)).astype(np.float32), device)
     encoded = encode_srgb(picture)
     encoded = encoded + bend * (encoded**2 * (3 - 2 * encoded) - encoded)
-    soft = _soften(encoded, np.array([sharpening.spread_px for sharpening in sharpenings]), 6)
+    soft = soften(encoded, np.array([sharpening.spread_px for sharpening in sharpenings]), 6)
     pixels = ((encoded + sharp * (encoded - soft)).clamp(0, 1) * 255).round()
     low, high = config.scenes.jpeg_quality
     quality = sent(rng.integers(low, high + 1, n).astype(np.float32), device)

@@ -32,10 +32,11 @@ class Batch:
     asked for, 0 for both: the other may be in the picture. ``place`` in 0..1 is which pixel of a network's cell its
     truth is, down and across: any at times, for always the first would move all answers by half a pixel.
     ``mirrors`` are the axes along which teachers see it mirrored, one of ``UPRIGHT`` among them: what they answer on
-    average errs less. ``contrast`` and ``light`` are the parts of its own in 0..1 that what learns is shown.
+    average errs less. ``shown`` are the images that what learns sees: worn ones, some of them.
     """
 
     image: Tensor
+    shown: Tensor
     excess: Tensor
     k_cam_px: Tensor
     gamma_px: Tensor
@@ -43,8 +44,6 @@ class Batch:
     focus_distance_m: Tensor
     focal_length_px: Tensor
     side: Tensor
-    contrast: Tensor
-    light: Tensor
     place: tuple[float, float] = field(default=(0.0, 0.0), kw_only=True)
     mirrors: tuple[Mirror, ...] = field(default=((),), kw_only=True)
 
@@ -59,13 +58,6 @@ class Batch:
 
     def conditioning(self) -> Conditioning:
         return Conditioning(self.focus_distance_m, self.focal_length_px, self.side)
-
-    def worn(self) -> "Batch":
-        """With less contrast and light, in steps of a grey level again: what learns sees the picture so."""
-        contrast, light = self.contrast[:, None, None, None], self.light[:, None, None, None]
-        mean = self.image.mean((2, 3), keepdim=True)
-        levels = (light * (mean + contrast * (self.image - mean)) * 255).round()
-        return replace(self, image=torch.where(contrast * light < 1, levels / 255, self.image))
 
 
 def laplace(error: Tensor, log_scale: Tensor) -> Tensor:
@@ -158,8 +150,8 @@ def likeness_loss(
 ) -> Tensor:
     """How far the answers are from the teachers', most where these are sure: float32 scalar.
 
-    But for the side, if not asked for: how often it is near is that of the scenes a teacher saw. Teachers see the
-    picture with all its contrast and light; how sure they are of it says nothing of a worn one.
+    But for the side, if not asked for: how often it is near is that of the scenes a teacher saw. Teachers see no worn
+    picture: how sure they are says nothing of it.
     """
     wise_blur, wise_depth = told_by(teachers, batch, shares)
     sure_blur = torch.exp(-BETA * wise_blur.log_error)
@@ -168,7 +160,7 @@ def likeness_loss(
     of_near = sure_depth * (depth.log_ratio_near - wise_depth.log_ratio_near).abs()
     of_far = sure_depth * (depth.log_ratio_far - wise_depth.log_ratio_far).abs()
     of_errors = (blur.log_error - wise_blur.log_error).abs() + (depth.log_scale - wise_depth.log_scale).abs()
-    of_errors = of_errors * (batch.contrast * batch.light == 1)[:, None, None, None]
+    of_errors = of_errors * (batch.shown == batch.image).flatten(1).all(1)[:, None, None, None]
     side = (torch.sigmoid(depth.near_logit) - torch.sigmoid(wise_depth.near_logit)).abs() if of_side else 0.0
     return (of_blur + of_near + of_far + of_errors / 2 + side).mean()
 
@@ -180,7 +172,7 @@ def total_loss(
 
     ``emphasis`` is that of what stands out.
     """
-    blur, depth = run_pair(pair, batch.worn())
+    blur, depth = run_pair(pair, replace(batch, image=batch.shown))
     excess = reduced(batch.excess, pair.stride, batch.place).float()
     defocus_px = excess.abs() * batch.k_cam_px[:, None, None, None]
     true_blur = thin_lens.blur_from_defocus(defocus_px, batch.gamma_px[:, None, None, None])

@@ -15,6 +15,7 @@ from threading import Thread
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
@@ -22,6 +23,7 @@ from model_export.config import MOST_SEED, UNCHANGED, SceneConfig, TrainConfig
 from model_export.darkroom import photograph
 from model_export.devices import new_stream, one_core, sent
 from model_export.losses import UPRIGHT, UPSIDE_DOWN, Batch, Mirror
+from model_export.noise_filter import filtered
 from model_export.scenes import Material, Negative, Sample, Shot, draw_negative, draw_sample
 
 FOCAL_UNKNOWN_SHARE = 0.3
@@ -29,6 +31,7 @@ LEAST_CONTRAST = 0.15  # of a faded picture, as a part of what it had
 LEAST_LIGHT = 0.2  # of a dimmed one
 # a camera known by its specs has a guess for gamma: mostly too low a one, since motion, haze and filters add softness
 GUESSED_GAMMA_SHARE, GUESSED_GAMMA = 0.6, (-0.2, 0.35)  # mean and standard deviation of the guess's log error
+FILTERED = 1  # beside a scene's seed
 HELD_OUT_SEED = (MOST_SEED + 1) * 2**32
 AHEAD = 64
 STOPS = (signal.SIGINT, signal.SIGTERM)
@@ -48,8 +51,14 @@ class SceneStream(Dataset[Drawn]):
 
     def __getitem__(self, index: int) -> Drawn:
         seed = self.config.seed * 2**32 + self.start + index
-        draw = draw_negative if self.config.retaken else draw_sample
-        return draw(seed, self.config.scenes, self.material)
+        if self.config.retaken:
+            return draw_negative(seed, self.config.scenes, self.material)
+        sample = draw_sample(seed, self.config.scenes, self.material)
+        rng = np.random.default_rng((seed, FILTERED))
+        if rng.random() >= self.config.filtered_share:
+            return sample
+        shown = filtered(rng, torch.from_numpy(sample.image)[None].float() / 255)[0]
+        return replace(sample, shown=(shown * 255).round().byte().numpy())
 
 
 def _worker_start(_: int) -> None:
@@ -172,14 +181,15 @@ def collate(samples: list[Sample], rng: np.random.Generator, config: TrainConfig
     Most are left upright: below is nearer, as in most photographs. A side is asked for at times, of scenes on both
     sides either: a near thing may stand before a far background.
     """
-    images, excesses, told = [], [], []
+    pictures, excesses, told = [], [], []
     for sample in samples:
         turns, flip = _turn(rng, config)
-        images.append(np.rot90(sample.image, turns, (1, 2))[:, :, ::flip].copy())
+        both = np.stack([sample.image, sample.image if sample.shown is None else sample.shown])
+        pictures.append(np.rot90(both, turns, (2, 3))[..., ::flip].copy())
         excesses.append(np.rot90(sample.excess, turns)[:, ::flip].astype(np.float32))
         told.append(_told(rng, sample.shot, config))
-    image = torch.from_numpy(np.stack(images)).float() / 255
-    return _batch(rng, config, image, torch.from_numpy(np.stack(excesses))[:, None], told)
+    image, shown = (torch.from_numpy(np.stack(pictures)).float() / 255).unbind(1)
+    return _batch(rng, config, (image, shown), torch.from_numpy(np.stack(excesses))[:, None], told)
 
 
 def collate_retaken(
@@ -195,7 +205,12 @@ def collate_retaken(
         both[chosen] = torch.rot90(both[chosen], turn, (2, 3))
     flipped = sent(np.array(flips) < 0, device)[:, None, None, None]
     both = torch.where(flipped, both.flip(3), both)
-    return _batch(rng, config, both[:, :3], both[:, 3:], [_told(rng, shot, config) for shot in shots])
+    image, excess = both[:, :3], both[:, 3:]
+    shown = image.clone()
+    if (items := np.flatnonzero(rng.random(len(shots)) < config.filtered_share)).size:
+        chosen = sent(items, device)
+        shown[chosen] = filtered(rng, image[chosen])
+    return _batch(rng, config, (image, shown), excess, [_told(rng, shot, config) for shot in shots])
 
 
 def _turn(rng: np.random.Generator, config: TrainConfig) -> tuple[int, int]:
@@ -204,7 +219,7 @@ def _turn(rng: np.random.Generator, config: TrainConfig) -> tuple[int, int]:
 
 
 def _told(rng: np.random.Generator, shot: Shot, config: TrainConfig) -> dict[str, float]:
-    """A shot as a batch has it, by the names there: what of its camera is known, guessed or asked for, and its wear."""
+    """A shot as a batch has it, by the names there: what of its camera is known, guessed or asked for."""
     focal = 0.0 if rng.random() < FOCAL_UNKNOWN_SHARE else shot.focal_length_px
     side = (shot.side or int(rng.choice([-1, 1]))) if rng.random() < config.hint_share else 0
     guess = math.exp(rng.normal(*GUESSED_GAMMA)) if rng.random() < GUESSED_GAMMA_SHARE else 1.0
@@ -215,26 +230,41 @@ def _told(rng: np.random.Generator, shot: Shot, config: TrainConfig) -> dict[str
         "focus_distance_m": shot.focus_distance_m,
         "focal_length_px": focal,
         "side": side,
-        "contrast": _left(rng, config.faded_share, LEAST_CONTRAST),
-        "light": _left(rng, config.dimmed_share, LEAST_LIGHT),
     }
 
 
-def _left(rng: np.random.Generator, share: float, least: float) -> float:
-    """What is left of 1, in that share of the pictures: at least so much, all orders of magnitude alike."""
-    return float(least ** rng.random()) if rng.random() < share else 1.0
+def _left(rng: np.random.Generator, count: int, share: float, least: float) -> NDArray[np.float32]:
+    """What is left of 1 [n], in that share of the pictures: at least so much, all orders of magnitude alike."""
+    return np.where(rng.random(count) < share, least ** rng.random(count), 1).astype(np.float32)
+
+
+def _worn(rng: np.random.Generator, shown: Tensor, config: TrainConfig) -> Tensor:
+    """Pictures [n,3,h,w], some with less contrast or light, in steps of a grey level again."""
+    left = ((config.faded_share, LEAST_CONTRAST), (config.dimmed_share, LEAST_LIGHT))
+    told = torch.from_numpy(np.stack([_left(rng, len(shown), *each) for each in left]))
+    contrast, light = sent(told, shown.device)[:, :, None, None, None]
+    mean = shown.mean((2, 3), keepdim=True)
+    levels = (light * (mean + contrast * (shown - mean)) * 255).round()
+    return torch.where(contrast * light < 1, levels / 255, shown)
 
 
 def _batch(
-    rng: np.random.Generator, config: TrainConfig, image: Tensor, excess: Tensor, told: Sequence[dict[str, float]]
+    rng: np.random.Generator,
+    config: TrainConfig,
+    pictures: tuple[Tensor, Tensor],
+    excess: Tensor,
+    told: Sequence[dict[str, float]],
 ) -> Batch:
+    """A batch of pictures as teachers are to see them, and as what learns is, before these wear."""
+    image, shown = pictures[0], _worn(rng, pictures[1], config)
     numbers = torch.tensor([[*each.values()] for each in told], dtype=torch.float32)
     columns = dict(zip(told[0], sent(numbers, image.device).unbind(1), strict=True))
     place = (rng.random(), rng.random())
     mirrors: tuple[Mirror, ...] = UPRIGHT + UPSIDE_DOWN
     if not config.all_mirrors:  # on two cores all four cost teachers more than the step itself
         mirrors = (UPRIGHT[rng.integers(2)], UPSIDE_DOWN[rng.integers(2)])
-    return Batch(image.contiguous(memory_format=torch.channels_last), excess, **columns, place=place, mirrors=mirrors)
+    image, shown = (maps.contiguous(memory_format=torch.channels_last) for maps in (image, shown))
+    return Batch(image, shown, excess, **columns, place=place, mirrors=mirrors)
 
 
 def held_out(scenes: SceneConfig, material: Material, numbers: Iterable[int]) -> Batch:

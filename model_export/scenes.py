@@ -88,11 +88,15 @@ class Scene:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One training example: picture uint8 [3,h,w] (sRGB), q - 1 as float16 [h,w], and the shot."""
+    """One training example: picture uint8 [3,h,w] (sRGB), q - 1 as float16 [h,w], and the shot.
+
+    ``shown`` is the picture that what learns is shown instead, where that is another one.
+    """
 
     image: NDArray[np.uint8]
     excess: NDArray[np.float16]
     shot: Shot
+    shown: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -108,3 +108,12 @@ def test_the_same_seed_takes_the_same_pictures_another_takes_others() -> None:
     assert torch.equal(one.image, same.image)
     assert torch.equal(one.excess, same.excess)
     assert not torch.equal(one.image, other.image)
+    assert torch.equal(one.shown, one.image)
+
+
+def test_some_pictures_that_are_taken_anew_go_through_a_noise_filter() -> None:
+    config = replace(CONFIG, filtered_share=0.5)
+    batch = collate_retaken(NEGATIVES, np.random.default_rng(0), config, CPU)
+    filtered = (batch.shown != batch.image).flatten(1).any(1)
+    assert 1 <= int(filtered.sum()) <= 7
+    assert float((batch.shown - batch.image).abs().mean()) < 0.05

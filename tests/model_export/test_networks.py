@@ -31,8 +31,9 @@ KINDS: list[Kind] = ["compact", "paper"]
 
 def batch(size: int = 64, count: int = 2) -> Batch:
     torch.manual_seed(0)
-    numbers = [torch.full((count,), value) for value in (3.81, 0.5, 0.5, 2.0, 500.0, 0.0, 1.0, 1.0)]
-    return Batch(torch.rand(count, 3, size, size), torch.rand(count, 1, size, size) - 0.3, *numbers)
+    numbers = [torch.full((count,), value) for value in (3.81, 0.5, 0.5, 2.0, 500.0, 0.0)]
+    images, excess = torch.rand(count, 3, size, size), torch.rand(count, 1, size, size) - 0.3
+    return Batch(images, images, excess, *numbers)
 
 
 @pytest.mark.parametrize("kind", KINDS)

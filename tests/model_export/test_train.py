@@ -23,8 +23,8 @@ from model_export.checkpoint import Checkpoint, starting_pair
 from model_export.config import LARGE_SEED, MOST_SEED, Learning, SceneConfig, TrainConfig
 from model_export.losses import UPRIGHT, UPSIDE_DOWN, Batch, likeness_loss, reduced, run_pair, told_by, total_loss
 from model_export.networks import Widths, make_pair, with_fresh_decoders
-from model_export.pool import HELD_OUT_SEED, Pools, collate
-from model_export.scenes import Material, draw_sample
+from model_export.pool import HELD_OUT_SEED, Pools, SceneStream, collate
+from model_export.scenes import Material, Sample, draw_sample
 from model_export.textures import load_photographs
 from model_export.train import CHECKPOINT, Trainer, config_of, emphasis, learning_rate, settling_step, train
 from service.cores import available_cores
@@ -457,21 +457,41 @@ def test_worn_pictures_have_less_contrast_or_light_in_grey_levels_still() -> Non
     samples = [draw_sample(seed, SCENES) for seed in range(12)]
     for config in (TrainConfig(faded_share=0.5), TrainConfig(dimmed_share=0.5)):
         batch = collate(samples, np.random.default_rng(0), config)
-        worn, left = batch.worn().image, (batch.contrast * batch.light)[:, None]
-        assert 2 <= int((left < 1).sum()) <= 10
-        torch.testing.assert_close(worn.std((2, 3)), left * batch.image.std((2, 3)), atol=2e-3, rtol=0.02)
-        light = batch.light[:, None] * batch.image.mean((2, 3))
-        torch.testing.assert_close(worn.mean((2, 3)), light, atol=2e-3, rtol=0)
-        levels = worn[left[:, 0] < 1] * 255
+        (worn, mean), (whole, mean_before) = ((one, one.mean((2, 3))) for one in (batch.shown, batch.image))
+        left = (worn.var((2, 3)).sum(1) / whole.var((2, 3)).sum(1)).sqrt()[:, None]
+        is_worn = (worn != whole).flatten(1).any(1)
+        assert 2 <= int(is_worn.sum()) <= 10
+        assert float(left[is_worn].max()) < 1
+        torch.testing.assert_close(worn.std((2, 3)), left * whole.std((2, 3)), atol=3e-3, rtol=0.02)
+        light = left if config.dimmed_share else torch.ones_like(left)
+        torch.testing.assert_close(mean, light * mean_before, atol=2e-3, rtol=0.01)
+        levels = worn * 255
         torch.testing.assert_close(levels, levels.round(), atol=1e-3, rtol=0)
-        assert torch.equal(worn[left[:, 0] == 1], batch.image[left[:, 0] == 1])
+
+
+def _mirrored(images: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    return images, images.flip(2), images.flip(3)
+
+
+def test_a_share_of_the_pictures_is_learned_as_a_noise_filter_leaves_them() -> None:
+    config = replace(CONFIG, filtered_share=0.5)
+    drawn = [SceneStream(config, Material([]), 0, 40)[number] for number in range(40)]
+    samples = [sample for sample in drawn if isinstance(sample, Sample)]
+    unlike = [sample.shown is not None and (sample.shown != sample.image).mean() > 0.3 for sample in samples]
+    assert 10 <= sum(unlike) <= 30
+    assert all(sample.shown is None for sample, other in zip(samples, unlike, strict=True) if not other)
+    batch = collate(samples, np.random.default_rng(0), config)
+    assert (batch.shown != batch.image).flatten(1).any(1).tolist() == unlike
+    unlike_by, down, across = ((batch.shown - image).abs().mean() for image in _mirrored(batch.image))
+    assert max(unlike_by / down, unlike_by / across) < 0.1  # turned and mirrored alike
 
 
 def test_teachers_see_whole_what_is_learned_of_worn_pictures() -> None:
     """How sure they are of the whole says nothing of how sure to be of less."""
     drawn = collate([draw_sample(seed, SCENES) for seed in range(2)], np.random.default_rng(0))
     whole = replace(drawn, mirrors=((),))
-    worn = replace(whole, contrast=torch.full((2,), 0.3))
+    mean = whole.image.mean((2, 3), keepdim=True)
+    worn = replace(whole, shown=mean + 0.3 * (whole.image - mean))
     wise = make_pair("compact")
     with torch.no_grad():
         wise.modules().get_parameter("depth.head.bias")[
