@@ -66,7 +66,7 @@ FROM_YCBCR = ((1.0, 0.0, 1.402), (1.0, -0.344136, -0.714136), (1.0, 1.772, 0.0))
 
 
 @lru_cache
-def _constant(values: tuple[Any, ...], device: torch.device) -> Tensor:
+def constant(values: tuple[Any, ...], device: torch.device) -> Tensor:
     """The same, once for all."""
     return torch.tensor(values, dtype=torch.float32).to(device)
 
@@ -161,7 +161,7 @@ def _through_mosaic(linear: Tensor) -> Tensor:
     seen = torch.zeros_like(linear)
     seen[:, 0, ::2, ::2], seen[:, 2, 1::2, 1::2] = linear[:, 0, ::2, ::2], linear[:, 2, 1::2, 1::2]
     seen[:, 1, ::2, 1::2], seen[:, 1, 1::2, ::2] = linear[:, 1, ::2, 1::2], linear[:, 1, 1::2, ::2]
-    around = _constant((SQUARE, CROSS, SQUARE), linear.device)[:, None] / 4
+    around = constant((SQUARE, CROSS, SQUARE), linear.device)[:, None] / 4
     return functional.conv2d(functional.pad(seen, (1,) * 4, mode="reflect"), around, groups=3)
 
 
@@ -179,7 +179,7 @@ def _quantised(plane: Tensor, steps: tuple[tuple[int, ...], ...], quality: Tenso
     n, h, w = plane.shape
     cosines = _cosines(plane.device)
     scale = torch.where(quality < 50, 5000 / quality, 200 - 2 * quality)[:, None, None]
-    table = ((_constant(steps, plane.device) * scale + 50) / 100).floor().clamp(1, 255)[:, None, None]
+    table = ((constant(steps, plane.device) * scale + 50) / 100).floor().clamp(1, 255)[:, None, None]
     blocks = plane.reshape(n, h // BLOCK, BLOCK, w // BLOCK, BLOCK).transpose(2, 3)
     kept = (cosines @ blocks @ cosines.T / table).round() * table
     return (cosines.T @ kept @ cosines).transpose(2, 3).reshape(n, h, w)
@@ -187,7 +187,7 @@ def _quantised(plane: Tensor, steps: tuple[tuple[int, ...], ...], quality: Tenso
 
 def compressed(pixels: Tensor, quality: Tensor) -> Tensor:
     """Pictures [n,3,h,w] in 0..255, sides multiples of 16, as JPEGs of these qualities [n] show them (4:2:0)."""
-    to, back = _constant(TO_YCBCR, pixels.device), _constant(FROM_YCBCR, pixels.device)
+    to, back = constant(TO_YCBCR, pixels.device), constant(FROM_YCBCR, pixels.device)
     ycbcr = torch.einsum("ij,njhw->nihw", to, pixels).round()
     light = _quantised(ycbcr[:, 0] - 128, LUMINANCE_STEPS, quality) + 128
     halved = functional.avg_pool2d(ycbcr[:, 1:], 2).round()

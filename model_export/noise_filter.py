@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from model_export.darkroom import TO_YCBCR, compressed, soften
+from model_export.darkroom import TO_YCBCR, compressed, constant, soften
 from model_export.devices import sent
 
 NOISE = (0.6, 7.0)  # grey levels, there before the filter
@@ -26,7 +26,7 @@ REACH_PX = 8
 
 
 def _brightness(pictures: Tensor) -> Tensor:
-    return (pictures * torch.tensor(TO_YCBCR[0], device=pictures.device)[:, None, None]).sum(1, keepdim=True)
+    return (pictures * constant(TO_YCBCR, pictures.device)[0, :, None, None]).sum(1, keepdim=True)
 
 
 def _means(pictures: Tensor, noise: Tensor, strength: Tensor, patch: int, reach: int) -> Tensor:
@@ -65,8 +65,7 @@ def filtered(rng: np.random.Generator, pictures: Tensor) -> Tensor:
         values = np.where(rng.random(n) < share, rng.uniform(low, high, n), 0)
         return sent(values.astype(np.float32), device)[:, None, None, None]
 
-    noise, strength = (torch.exp(some(*np.log(span))) for span in (NOISE, STRENGTH))
-    noise = noise / 255
+    noise, strength = torch.exp(some(*np.log(NOISE))) / 255, torch.exp(some(*np.log(STRENGTH)))
     source = torch.Generator(device).manual_seed(int(rng.integers(2**62)))
     grainy = pictures + noise * torch.randn(pictures.shape, generator=source, device=device)
     if rng.random() < CORED_SHARE:

@@ -206,10 +206,10 @@ def collate_retaken(
     flipped = sent(np.array(flips) < 0, device)[:, None, None, None]
     both = torch.where(flipped, both.flip(3), both)
     image, excess = both[:, :3], both[:, 3:]
-    shown = image.clone()
+    shown = image
     if (items := np.flatnonzero(rng.random(len(shots)) < config.filtered_share)).size:
         chosen = sent(items, device)
-        shown[chosen] = filtered(rng, image[chosen])
+        shown = image.index_copy(0, chosen, filtered(rng, image[chosen]))
     return _batch(rng, config, (image, shown), excess, [_told(rng, shot, config) for shot in shots])
 
 

@@ -462,15 +462,11 @@ def test_worn_pictures_have_less_contrast_or_light_in_grey_levels_still() -> Non
         is_worn = (worn != whole).flatten(1).any(1)
         assert 2 <= int(is_worn.sum()) <= 10
         assert float(left[is_worn].max()) < 1
-        torch.testing.assert_close(worn.std((2, 3)), left * whole.std((2, 3)), atol=3e-3, rtol=0.02)
+        torch.testing.assert_close(worn.std((2, 3)), left * whole.std((2, 3)), atol=2e-3, rtol=0.02)
         light = left if config.dimmed_share else torch.ones_like(left)
-        torch.testing.assert_close(mean, light * mean_before, atol=2e-3, rtol=0.01)
+        torch.testing.assert_close(mean, light * mean_before, atol=2e-3, rtol=0)
         levels = worn * 255
         torch.testing.assert_close(levels, levels.round(), atol=1e-3, rtol=0)
-
-
-def _mirrored(images: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    return images, images.flip(2), images.flip(3)
 
 
 def test_a_share_of_the_pictures_is_learned_as_a_noise_filter_leaves_them() -> None:
@@ -482,7 +478,7 @@ def test_a_share_of_the_pictures_is_learned_as_a_noise_filter_leaves_them() -> N
     assert all(sample.shown is None for sample, other in zip(samples, unlike, strict=True) if not other)
     batch = collate(samples, np.random.default_rng(0), config)
     assert (batch.shown != batch.image).flatten(1).any(1).tolist() == unlike
-    unlike_by, down, across = ((batch.shown - image).abs().mean() for image in _mirrored(batch.image))
+    unlike_by, down, across = ((batch.shown - batch.image.flip(axes)).abs().mean() for axes in ((), (2,), (3,)))
     assert max(unlike_by / down, unlike_by / across) < 0.1  # turned and mirrored alike
 
 
