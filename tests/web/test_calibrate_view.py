@@ -14,6 +14,8 @@ import pytest
 from playwright.sync_api import Browser, Dialog, Page, Route, expect
 
 from model_export.started_server import Server, serving
+from service.config import SHIPPED_MODEL
+from tests.held_server import HOLD, write_command
 from tests.inference.photographs import tiff
 from tests.simulated_sheets import CAMERA, DEPTHS_M, GRID, sheet_photos
 from tests.web.steps import OVERFLOW, change, eventually, to_photographs
@@ -62,9 +64,31 @@ def name() -> str:
     return f"bench-{uuid4().hex[:8]}"
 
 
+@pytest.fixture(scope="module")
+def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("held") / "data"
+
+
+@pytest.fixture(scope="module")
+def served(data_dir: Path) -> Iterator[Server]:
+    """A service whose calibrations can be held, for pages that look at one that runs."""
+    command = write_command(data_dir.parent, "real")
+    with serving(data_dir, "--model", SHIPPED_MODEL, camind=command) as server:
+        yield server
+
+
+@pytest.fixture
+def hold(data_dir: Path) -> Path:
+    """While this file is there, calibrations are held."""
+    hold = data_dir / HOLD
+    hold.touch()
+    return hold
+
+
 @pytest.fixture(autouse=True)
-def no_calibration(served: Server) -> Iterator[None]:
+def no_calibration(served: Server, data_dir: Path) -> Iterator[None]:
     yield
+    (data_dir / HOLD).unlink(missing_ok=True)
     for item in served.ask("GET", "/calibrations").json()["items"]:
         served.ask("DELETE", f"/calibrations/{item['id']}")
 
@@ -381,6 +405,7 @@ def test_a_set_becomes_a_camera(
     served: Server,
     photographs: list[Path],
     name: str,
+    hold: Path,
     d200: dict[str, Any],
     barriers: Callable[[Page], list[str]],
 ) -> None:
@@ -396,6 +421,7 @@ def test_a_set_becomes_a_camera(
     with watched(browser, served.url, []) as other:
         other.goto("#calibrate")
         expect(other.get_by_role("heading", name=f"Calibrating {name}")).to_be_visible()
+    hold.unlink()
     expect(page.get_by_role("heading", name=f"What was found for {name}")).to_be_visible(timeout=LONG_MS)
     item = served.ask("GET", "/calibrations?limit=1").json()["items"][0]
     job = served.ask("GET", f"/calibrations/{item['id']}").json()
@@ -432,7 +458,7 @@ def test_one_that_found_nothing_says_why_and_goes_back(page: Page, photographs: 
     expect(page.get_by_role("list", name="Photographs").get_by_role("listitem")).to_have_count(1)
 
 
-def test_a_running_one_is_cancelled(page: Page, served: Server, photographs: list[Path], name: str) -> None:
+def test_a_running_one_is_cancelled(page: Page, served: Server, photographs: list[Path], name: str, hold: Path) -> None:
     to_photographs(page, name)
     drop(page, *photographs[:3])
     page.get_by_role("button", name="Start the calibration").click()
@@ -441,6 +467,7 @@ def test_a_running_one_is_cancelled(page: Page, served: Server, photographs: lis
     newest = served.ask("GET", "/calibrations").json()["items"][0]
     assert (newest["camera"], newest["state"]) == (name, "cancelled")
     expect(page.get_by_role("row", name=re.compile(f"{name}.*cancelled"))).to_be_visible()
+    hold.unlink()
     # the same photographs once more are another calibration
     page.get_by_role("button", name="Back to the photographs").click()
     page.get_by_role("button", name="Start the calibration").click()
