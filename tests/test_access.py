@@ -4,9 +4,11 @@ import json
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta, timezone
 from ipaddress import IPv4Address
 from pathlib import Path
+from threading import Semaphore
 from typing import Any
 
 import pytest
@@ -18,6 +20,7 @@ from starlette.testclient import TestClient
 
 from model_export.started_server import serving
 from service.access import is_public, needed_scope
+from service.api.clients import Followers
 from service.app import create_app
 from service.config import Settings
 from service.errors import BadRequest, NotFound
@@ -52,6 +55,22 @@ def keys(client: TestClient, app: FastAPI) -> Keys:
     assert client.get("/health/live").status_code == 200
     found: Keys = app.state.keys
     return found
+
+
+@pytest.fixture
+def followed(monkeypatch: pytest.MonkeyPatch) -> Semaphore:
+    """Released once for every request that has begun to wait for changes."""
+    begun = Semaphore(0)
+    counted = Followers.counted
+
+    @contextmanager
+    def told(followers: Followers, owner: str) -> Iterator[None]:
+        with counted(followers, owner):
+            begun.release()
+            yield
+
+    monkeypatch.setattr(Followers, "counted", told)
+    return begun
 
 
 def bearer(keys: Keys, owner: str, *scopes: Scope, **more: Any) -> dict[str, str]:
@@ -263,7 +282,7 @@ def test_a_new_key_takes_the_place_of_a_revoked_one(client: TestClient, keys: Ke
 
 
 def test_a_revoked_key_is_told_no_more_of_what_it_follows(
-    client: TestClient, keys: Keys, fake: FakeCalibration
+    client: TestClient, keys: Keys, fake: FakeCalibration, followed: Semaphore
 ) -> None:
     fake.go.clear()
     key, text = keys.create("first", "lab")
@@ -271,8 +290,7 @@ def test_a_revoked_key_is_told_no_more_of_what_it_follows(
     path = calibrated(client, new).headers["location"]
     with ThreadPoolExecutor(2) as pool:
         told, untold = (pool.submit(client.get, f"{path}/events", headers=headers) for headers in (new, old))
-        assert fake.has_begun.wait(10)
-        time.sleep(1)
+        assert all(followed.acquire(timeout=10) for _ in (new, old))
         keys.revoke(key.id)
         fake.go.set()
         assert '"succeeded"' in told.result().text
@@ -280,7 +298,7 @@ def test_a_revoked_key_is_told_no_more_of_what_it_follows(
 
 
 def test_who_follows_is_bounded_for_each_owner(
-    client: TestClient, keys: Keys, fake: FakeCalibration, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, keys: Keys, fake: FakeCalibration, followed: Semaphore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("service.api.clients.MOST_FOLLOWERS", 2)
     fake.go.clear()
@@ -288,12 +306,12 @@ def test_who_follows_is_bounded_for_each_owner(
     own, other = (f"{calibrated(client, headers).headers['location']}/events" for headers in (mine, theirs))
     with ThreadPoolExecutor(3) as pool:
         following = [pool.submit(client.get, own, headers=mine) for _ in range(2)]
-        time.sleep(1)
+        assert all(followed.acquire(timeout=10) for _ in following)
         refused(client.get(own, headers=mine), 503, "busy")
         not_waited = calibrated(client, mine | {"Prefer": "wait=60"})
         assert (not_waited.status_code, "preference-applied" in not_waited.headers) == (202, False)
         following.append(pool.submit(client.get, other, headers=theirs))
-        time.sleep(0.5)
+        assert followed.acquire(timeout=10)
         fake.go.set()
         assert all('"succeeded"' in each.result().text for each in following)
     assert client.get(own, headers=mine).status_code == 200
@@ -319,9 +337,9 @@ def test_the_log_says_why_keys_cannot_be_looked_up(client: TestClient, app: Fast
 
 
 def test_a_key_expires(client: TestClient, keys: Keys) -> None:
-    soon = bearer(keys, "lab", expires_at=datetime.now(UTC) + timedelta(seconds=0.5))
+    soon = bearer(keys, "lab", expires_at=datetime.now(UTC) + timedelta(seconds=2))
     assert client.get("/cameras", headers=soon).status_code == 200
-    time.sleep(0.6)
+    time.sleep(2)
     refused(client.get("/cameras", headers=soon), 401, "unauthorized")
 
 

@@ -135,13 +135,15 @@ def test_who_goes_away_while_sending_leaves_nothing(data_dir: Path, server: Serv
 
 
 def test_who_goes_away_while_waiting_loses_nothing(server: Server) -> None:
+    def states() -> list[str]:
+        return [item["state"] for item in server.ask("GET", "/calibrations").json()["items"]]
+
     request = form()
     with _half_sent(server, request, "Prefer: wait=60\r\n") as connection:
         connection.sendall(request.content[100:])
-        server.poll(lambda: server.ask("GET", "/calibrations").json()["items"])
+        server.poll(lambda: states() == ["running"])
     time.sleep(0.5)
-    items = server.ask("GET", "/calibrations").json()["items"]
-    assert [item["state"] for item in items] == ["running"]
+    assert states() == ["running"]
 
 
 def _half_sent(server: Server, request: Request, headers: str = "") -> socket.socket:

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import MISSING, asdict, fields
 from pathlib import Path
+from threading import Semaphore
 from typing import Any
 from uuid import uuid4
 
@@ -20,6 +21,7 @@ from starlette.testclient import TestClient
 from service.app import create_app
 from service.config import Settings
 from service.inference.exif import F_NUMBER
+from service.storage.calibrations import Calibrations
 from service.storage.engine import writing
 from service.storage.tables import CalibrationRow
 from tests.fake_calibration import RESULT, SETTINGS, FakeCalibration, without_calibrations
@@ -235,15 +237,26 @@ def test_waiting_outlasts_a_database_that_fails(client: TestClient, app: FastAPI
     assert ended(client, answer.headers["location"])["state"] == "succeeded"
 
 
-def test_events_outlast_a_database_that_fails(client: TestClient, app: FastAPI, fake: FakeCalibration) -> None:
+def test_events_outlast_a_database_that_fails(
+    client: TestClient, app: FastAPI, fake: FakeCalibration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, version = Semaphore(0), Calibrations.version
+
+    def told(calibrations: Calibrations, calibration_id: str) -> int:
+        try:
+            return version(calibrations, calibration_id)
+        finally:
+            asked.release()
+
+    monkeypatch.setattr(Calibrations, "version", told)
     fake.go.clear()
     path = send(client).headers["location"]
     assert fake.has_begun.wait(PATIENCE_S)
     with ThreadPoolExecutor(1) as pool:
         following = pool.submit(client.get, f"{path}/events")
-        time.sleep(0.5)
+        assert asked.acquire(timeout=PATIENCE_S)
         with without_calibrations(app.state.engine):
-            time.sleep(0.5)
+            assert all(asked.acquire(timeout=PATIENCE_S) for _ in range(2))
         fake.go.set()
         events = events_of(following.result())
     assert events[-1][1]["state"] == "succeeded"
