@@ -3,7 +3,7 @@
 Weights have seven bits (``reduce_range``), because AVX2 without integer dot products adds pairs of products in sixteen.
 Where int8 and float32 meet, maps are turned round in memory and bytes made numbers, or numbers bytes, each at the price
 of a small convolution. So heads, which see one cell each, are products of the numbers as they lie, channels last, and
-features go from graph to graph as bytes. What rounding shifts on average is taken back by the biases.
+features go from graph to graph as bytes. Weights make up for what rounding the others does, and biases on average.
 """
 
 import logging
@@ -23,12 +23,14 @@ from onnxruntime.quantization.shape_inference import quant_pre_process
 from model_export.config import SceneConfig
 from model_export.export import feature_names, finish
 from model_export.networks import Pair
+from model_export.rounded import Seen, rounded
 from model_export.scenes import draw_sample
 from model_export.verify import CAMERA, through_torch
 from service.inference.artifact import GraphFile, Graphs, TensorSpec, load_model_folder, sha256_of
 
 SCENES = 48
 FIRST_SEED = 2**41  # neither a training's nor a held-out scene's
+MOST_STEPS = 64  # either way: seven bits
 QUANTISED = ("Conv", "Relu", "MaxPool", "Resize", "Add")
 FIRST_OF_BLUR, FIRST_OF_DEPTH = "network.unet.encoder.0.layers.1.", "network.unet.encoder.0.layers.0."
 CHANNELS_LAST, CHANNELS_FIRST = (0, 2, 3, 1), (0, 3, 1, 2)
@@ -102,39 +104,65 @@ def _quantised(path: Path, feeds: list[Feeds], first: str) -> onnx.ModelProto:
         finally:
             logging.root.setLevel(level)
         model = onnx.load(quantised)
-    _take_back_shifts(model, floating, feeds)
+    _make_up(model, floating, feeds)
     return model
 
 
-def _take_back_shifts(model: onnx.ModelProto, floating: onnx.ModelProto, feeds: list[Feeds]) -> None:
-    """Change biases so that every sum of products is on average by channel what it is in float32.
+def _make_up(model: onnx.ModelProto, floating: onnx.ModelProto, feeds: list[Feeds]) -> None:
+    """Have every sum of products answer nearly what it does in float32, and by channel on average just that.
 
-    One convolution after the other, each seeing what those before it answer now: the empirical bias correction of Nagel
-    et al., Data-Free Quantization Through Weight Equalization and Bias Correction (ICCV 2019).
+    One convolution after the other, each seeing what those before it answer now: its weights are rounded anew, then its
+    bias is changed, which is the empirical bias correction of Nagel et al., Data-Free Quantization Through Weight
+    Equalization and Bias Correction (ICCV 2019).
     """
-    wanted = _channel_means(floating, [node for node in floating.graph.node if node.op_type == "Conv"], feeds)
-    values = {tensor.name: tensor for tensor in model.graph.initializer}
+    in_float = {node.name: node for node in floating.graph.node if node.op_type == "Conv"}
+    exact, values = (_constants(each) for each in (floating, model))
+    wanted = _channel_means(floating, list(in_float.values()), feeds)
     makers = {node.output[0]: node for node in model.graph.node}
-    for convolution in [node for node in model.graph.node if node.op_type == "Conv" and len(node.input) == 3]:
-        made = makers.get(convolution.input[2])  # numbers from an int32 bias, where the convolution is quantised
-        if made is None:
-            continue
-        means = _channel_means(model, [convolution], feeds)[convolution.name]
-        bias, scale = (values[name] for name in made.input[:2])
-        shift = (wanted[convolution.name] - means) / numpy_helper.to_array(scale)
-        bias.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(bias) + np.rint(shift).astype(np.int32), bias.name))
+    for convolution in [node for node in model.graph.node if node.op_type == "Conv" and node.input[1] in makers]:
+        kernels, steps = (values[name] for name in makers[convolution.input[1]].input[:2])
+        weights = numpy_helper.to_array(exact[in_float[convolution.name].input[1]]).astype(np.float64)
+        by_output, step = weights.reshape(len(weights), -1), numpy_helper.to_array(steps)[:, np.newaxis]
+        seen = _seen(model, convolution, feeds)
+        whole = rounded(by_output / step, MOST_STEPS, seen.covariances)
+        _change(kernels, whole.reshape(weights.shape))
+        made = makers.get(convolution.input[2]) if len(convolution.input) == 3 else None
+        if made is not None:  # numbers from an int32 bias
+            bias, scale = (values[name] for name in made.input[:2])
+            _change(bias, (wanted[convolution.name] - whole * step @ seen.means) / numpy_helper.to_array(scale))
+
+
+def _constants(model: onnx.ModelProto) -> dict[str, TensorProto]:
+    return {tensor.name: tensor for tensor in model.graph.initializer}
+
+
+def _change(tensor: TensorProto, values: NDArray[np.float64]) -> None:
+    """Other values for a constant of whole numbers."""
+    kind = helper.tensor_dtype_to_np_dtype(tensor.data_type)
+    tensor.CopyFrom(numpy_helper.from_array(np.rint(values).astype(kind), tensor.name))
+
+
+def _seen(model: onnx.ModelProto, convolution: onnx.NodeProto, feeds: list[Feeds]) -> Seen:
+    """What a convolution of a graph sees."""
+    said = {attribute.name: helper.get_attribute_value(attribute) for attribute in convolution.attribute}
+    maps = [each[0] for each in _answers(model, [convolution.input[0]], feeds)]
+    return Seen.of(maps, tuple(said["kernel_shape"]), said["dilations"][0], said["pads"][0])
 
 
 def _channel_means(model: onnx.ModelProto, nodes: list[onnx.NodeProto], feeds: list[Feeds]) -> Means:
     """What nodes of a graph answer, by name: means [c] over pictures and cells."""
+    means = [[maps.mean((0, 2, 3)) for maps in each] for each in _answers(model, [n.output[0] for n in nodes], feeds)]
+    return {node.name: np.mean(of_one, axis=0) for node, of_one in zip(nodes, zip(*means, strict=True), strict=True)}
+
+
+def _answers(model: onnx.ModelProto, names: list[str], feeds: list[Feeds]) -> Iterator[list[NDArray[np.float32]]]:
+    """What a graph computes under these names, for each of the feeds."""
     watched = onnx.ModelProto()
     watched.CopyFrom(model)
-    outputs = [node.output[0] for node in nodes]
     known = {output.name for output in watched.graph.output}
-    watched.graph.output.extend(onnx.ValueInfoProto(name=name) for name in outputs if name not in known)
+    watched.graph.output.extend(onnx.ValueInfoProto(name=name) for name in names if name not in known)
     session = InferenceSession(watched.SerializeToString(), providers=["CPUExecutionProvider"])
-    means = [[maps.mean((0, 2, 3)) for maps in session.run(outputs, feed)] for feed in feeds]
-    return {node.name: np.mean(of_one, axis=0) for node, of_one in zip(nodes, zip(*means, strict=True), strict=True)}
+    return (session.run(names, feed) for feed in feeds)
 
 
 def _from_first_to_last(model: onnx.ModelProto, first: str) -> list[str]:
@@ -151,7 +179,7 @@ def _answer_by_cell(model: onnx.ModelProto) -> None:
     Where its numbers left the graph as features, the bytes do that they are made from.
     """
     graph = model.graph
-    values = {tensor.name: tensor for tensor in graph.initializer}
+    values = _constants(model)
     head = [node for node in graph.node if node.op_type == "Conv"][-1]
     numbers = next(node for node in graph.node if node.output[0] == head.input[0])
     weights, bias = (numpy_helper.to_array(values[name]) for name in head.input[1:])
@@ -177,7 +205,7 @@ def _answer_by_cell(model: onnx.ModelProto) -> None:
 def _take_bytes(depth: onnx.ModelProto, blur: onnx.ModelProto) -> None:
     """Have features go from graph to graph as bytes [n,h,w,c], by the blur graph's scale."""
     made = next(node for node in depth.graph.node if node.input[0] == FEATURES)
-    own, others = ({tensor.name: tensor for tensor in model.graph.initializer} for model in (depth, blur))
+    own, others = (_constants(model) for model in (depth, blur))
     for name in made.input[1:]:
         own[name].CopyFrom(others[name])
     made.CopyFrom(helper.make_node("Transpose", [FEATURES], made.output, perm=CHANNELS_FIRST))
