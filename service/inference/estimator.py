@@ -320,8 +320,6 @@ class Estimator:
         told += _outside("k_cam_px at that size", k_cam_px, ranges.k_cam_px)
         told += _outside("gamma_px at that size", gamma_px, ranges.gamma_px)
         told += _outside("focus_distance_m", camera.focus_distance_m, ranges.focus_distance_m)
-        if camera.intrinsics:
-            told += _outside("fx_px at that size", camera.intrinsics.fx_px, ranges.focal_length_px)
         return told
 
 
