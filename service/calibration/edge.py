@@ -215,7 +215,7 @@ def _start(patch: Patch, x: float, y: float, radius: float) -> Array:
 def _fitted(patch: Patch, start: Array, spread: PointSpread) -> EdgeFit:
     white, span = start[7], patch.side
     low = np.array([0, 0, math.log(2), -0.8, -0.8, math.log(0.15), 0.0, 0.2 * white, -white, -white])
-    high = np.array([span, span, math.log(span), 0.8, 0.8, math.log(span / 3), 1.2, 3 * white, white, white])
+    high = np.array([span, span, math.log(span), 0.8, 0.8, math.log(span / 3), 1.0, 3 * white, white, white])
 
     @lru_cache(maxsize=2)
     def picture(values: bytes) -> tuple[Array, Array]:
