@@ -13,7 +13,6 @@ from service.optics.camera import Intrinsics
 
 Array = NDArray[np.float64]
 
-BIAS_ROUNDS = 2
 RIM_POINTS = 48
 LEAST_VIEWS = 2
 LITTLE_TILT_DEG = 8.0
@@ -65,10 +64,8 @@ def place(grid: CircleGrid, views: Sequence[View], size_px: tuple[int, int]) -> 
             f"are the least from which a focal length, and so a distance, can be had, {FEW_VIEWS} or more are better"
         )
     flat = np.column_stack([grid.points_mm(), np.zeros(grid.rows * grid.columns)])
-    centres = [view.centres_px for view in views]
-    for _ in range(BIAS_ROUNDS):
-        solved = _solved(flat, views, centres, size_px)
-        centres = [view.centres_px - _bias(flat, grid, view, solved, i) for i, view in enumerate(views)]
+    seen = _solved(flat, views, [view.centres_px for view in views], size_px)
+    centres = [view.centres_px - _bias(flat, grid, view, seen, i) for i, view in enumerate(views)]
     solved = _solved(flat, views, centres, size_px)
     board, solved, error = _freed(flat, grid, views, centres, size_px, solved)
     bent_mm = float(np.linalg.norm(board - flat, axis=1).max())
