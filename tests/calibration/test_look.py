@@ -39,7 +39,9 @@ def test_a_sheet_whose_circles_are_not_as_told_beside_their_spacing_is_noticed(
     rng = np.random.default_rng(3)
     taken = photograph(rng, CAMERA, draw_pose(rng, CAMERA, sheet, 0.42), sheet, focused=False)
     told = (
-        replace(sheet, **{wrong: getattr(sheet, wrong) * (1.41 if wrong == "spacing_mm" else 0.71)}) if wrong else sheet
+        replace(sheet, **{wrong: getattr(sheet, wrong) * (1.41 if wrong == "spacing_mm" else 0.71)})
+        if wrong
+        else replace(sheet, diameter_mm=0.95 * sheet.diameter_mm)  # as ink spreads
     )
     said = [warning for warning in look(taken, told, None).warnings if "one of spacing_mm and diameter_mm" in warning]
     assert [" 1.4" in warning for warning in said] == [True] * bool(wrong)

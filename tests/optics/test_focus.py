@@ -1,5 +1,7 @@
 """Where a lens was focused, from blur at known depths."""
 
+import math
+import random
 from dataclasses import replace
 
 import pytest
@@ -50,7 +52,7 @@ def test_where_k_cam_is_large_the_focus_distance_is_found_as_finely_as_blur_tell
     assert max(fit.deviations) < 0.5
 
 
-@pytest.mark.parametrize(("true_m", "depth_m"), [(0.193, 0.2), (0.186, 0.2), (0.2137, 0.22)])
+@pytest.mark.parametrize(("true_m", "depth_m"), [(0.193, 0.2), (0.186, 0.2), (0.2137, 0.22), (0.199, 0.2)])
 def test_where_k_cam_is_large_one_thing_is_blurred_by_the_focus_found_as_it_was(true_m: float, depth_m: float) -> None:
     fit = fitted(true_m, depth_m, told=Camera(1440, 1080, 0.2, 800.0, 0.6, focal_length_m=0.05))
     assert fit.focus_distance_m == pytest.approx(true_m, rel=6e-4)
@@ -72,6 +74,8 @@ def test_one_thing_tells_it_less_surely_than_three() -> None:
 def test_of_one_thing_close_to_focus_either_side_of_it_is_possible() -> None:
     fit = fitted(1.9, 2.0)
     assert fit.low_m < 1.9 < 2.1 < fit.high_m
+    macro = fitted(0.1975, 0.2, told=Camera(1440, 1080, 0.2, 800.0, 0.6, focal_length_m=0.05))
+    assert macro.low_m < 0.1975 < 0.2025 < macro.high_m
 
 
 def test_what_is_told_stands_where_a_thing_close_to_it_is_read_too_blurred() -> None:
@@ -88,6 +92,7 @@ def test_of_one_thing_close_to_focus_that_side_is_taken_on_which_all_was_said_to
     told = CAMERA.focused_at(told_m)
     fit, without = fit_focus(told, seen, is_near), fit_focus(told, seen)
     assert fit.low_m < 2.0 < fit.high_m
+    assert fit.low_m > 0.85 * depth_m if is_near else fit.high_m < 1.15 * depth_m
     assert (fit.focus_distance_m > depth_m) == is_near != (without.focus_distance_m > depth_m)
 
 
@@ -102,6 +107,20 @@ def test_of_a_large_k_cam_what_is_clearly_blurred_is_on_its_side_however_near_fo
 def test_a_doubtful_reading_moves_it_less() -> None:
     sure, doubtful = (fitted(1.6, 1.2, error=error).focus_distance_m for error in (0.1, 0.8))
     assert 1.6 < sure < doubtful < 2.0
+
+
+def test_the_intervals_hold_and_tell_something() -> None:
+    """Of focus told to a tenth, as by a ring, and two things read to 15 %."""
+    rng = random.Random(0)
+    held, widths = 0, []
+    for _ in range(60):
+        true = CAMERA.focused_at(2.0 * math.exp(rng.gauss(0, 0.1)))
+        depths_m = rng.sample(DEPTHS_M, 2)
+        fit = fit_focus(CAMERA, [Sighting(z, true.blur_px(z) * math.exp(rng.gauss(0, 0.15)), 0.15) for z in depths_m])
+        held += fit.low_m <= true.focus_distance_m <= fit.high_m
+        widths.append(fit.high_m / fit.low_m)
+    assert held >= 55
+    assert sum(widths) / 60 < 1.35
 
 
 @pytest.mark.parametrize("mistaken_m", [1.6, 0.4])
@@ -134,12 +153,18 @@ def test_nothing_known_tells_nothing() -> None:
         fit_focus(CAMERA, [])
 
 
-@pytest.mark.parametrize("true_m", [10.0, 5.0, 3.0])
+@pytest.mark.parametrize("true_m", [10.0, 5.0, 3.0, 1.6])
 def test_a_lens_said_to_be_at_infinity_is_found_at_its_hyperfocal_distance(true_m: float) -> None:
     told = Camera(640, 480, 100_000.0, 7.6e-5, 0.5)
     fit = fitted(true_m, 0.5, 0.8, 1.2, told=told)
     assert 1 / fit.focus_distance_m == pytest.approx(1 / true_m, abs=0.04)
     assert fit.low_m <= true_m <= fit.high_m
+
+
+def test_of_a_lens_said_to_be_at_infinity_one_thing_tells_where_it_is_and_one_read_badly_hardly() -> None:
+    told = Camera(640, 480, 100_000.0, 7.6e-5, 0.5)
+    assert fitted(3.0, 0.8, told=told).focus_distance_m == pytest.approx(3.0, rel=0.2)
+    assert fitted(3.0, 0.8, told=told, error=0.8).focus_distance_m > 10
 
 
 def test_a_lens_at_infinity_is_left_there() -> None:
