@@ -214,6 +214,7 @@ def _start(patch: Patch, x: float, y: float, radius: float) -> Array:
 
 def _fitted(patch: Patch, start: Array, spread: PointSpread) -> EdgeFit:
     white, span = start[7], patch.side
+    # no circle is blacker than black: where it may be, it and the spread of a disc change roles
     low = np.array([0, 0, math.log(2), -0.8, -0.8, math.log(0.15), 0.0, 0.2 * white, -white, -white])
     high = np.array([span, span, math.log(span), 0.8, 0.8, math.log(span / 3), 1.0, 3 * white, white, white])
 

@@ -173,7 +173,7 @@ def test_the_less_the_sheet_is_tilted_the_larger_is_the_error_stated(tilted: flo
     assert found.focal_error * tilted**2 == pytest.approx(2.6e-4, rel=0.2), "as the square of the tilt"
 
 
-@pytest.mark.parametrize("tilted", [0.0, 0.04])
+@pytest.mark.parametrize("tilted", [0.0, 0.05])
 def test_sheets_that_were_hardly_tilted_tell_no_focal_length(tilted: float) -> None:
     seen, _ = views(flat(FEWER), tilted=tilted)
     with pytest.raises(PoseError, match="tilt the sheet by 15 to 25 degrees"):
@@ -213,7 +213,7 @@ def test_one_sheet_that_is_not_tilted_is_no_matter() -> None:
     tilted, _ = views(flat(FEWER))
     assert not any("never tilted" in warning for warning in place(FEWER, [straight, *tilted[1:]], SIZE).warnings)
     said = [place(FEWER, views(flat(FEWER), tilted=tilted)[0], SIZE).warnings for tilted in (0.35, 0.45)]
-    assert [any("never tilted by more than 7 degrees" in warning for warning in each) for each in said] == [True, False]
+    assert [any("never tilted" in warning for warning in each) for each in said] == [True, False]
 
 
 def test_sheets_in_mirrored_pictures_stand_as_in_others(found: Placement) -> None:
