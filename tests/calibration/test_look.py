@@ -73,6 +73,17 @@ def test_what_is_told_half_or_twice_as_large_is_said_to_be_of_another_size(told:
     assert ("of quite another size than spacing_mm and diameter_mm say" in said) == (len(told) == 1), said
 
 
+def test_circles_at_the_border_of_the_picture_are_left_out() -> None:
+    rng = np.random.default_rng(3)
+    taken = photograph(rng, CAMERA, draw_pose(rng, CAMERA, SHEETS[0], 0.42), SHEETS[0], focused=True)
+    whole, part = (Measured(PictureReport("", "focused", found=False)) for _ in range(2))
+    measure(whole, taken, SHEETS[0], lambda _: None)
+    right, bottom = (np.max(whole.centres_px, 0) + 1.4 * whole.edges[0].radius_px).astype(int)
+    measure(part, np.ascontiguousarray(taken[:bottom, :right]), SHEETS[0], lambda _: None)
+    assert 0 < len(part.circles) < len(whole.circles)
+    assert "too near the border" in " ".join(part.report.warnings)
+
+
 def test_a_look_stops_while_it_searches_for_the_sheet() -> None:
     calls = 0
 

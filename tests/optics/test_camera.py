@@ -38,9 +38,10 @@ def test_gamma_is_zero_or_more(gamma: float) -> None:
         camera(gamma_px=gamma)
 
 
-def test_focal_length_is_shorter_than_focus() -> None:
+@pytest.mark.parametrize("focal_length_m", [2.0, 0.0, -0.05])
+def test_focal_length_is_positive_and_shorter_than_focus(focal_length_m: float) -> None:
     with pytest.raises(ValueError, match="focal_length_m"):
-        camera(focal_length_m=2.0)
+        camera(focal_length_m=focal_length_m)
 
 
 def test_resizing_scales_blur_and_leaves_depth() -> None:
@@ -174,6 +175,11 @@ def test_a_part_of_a_picture_is_seen_where_it_was() -> None:
 def test_a_range_never_begins_beyond_its_end() -> None:
     near, far = Camera(640, 480, 2.0, 0.05, focal_length_m=0.05).range_m
     assert near == far == pytest.approx(0.1 * 2.0 * 0.05 / 0.25)
+
+
+def test_a_curve_is_drawn_around_focus_beyond_the_range_too_unless_that_is_infinity() -> None:
+    assert camera(k_cam_px=0.5).middle_m == 2.0 > camera(k_cam_px=0.5).range_m[1]
+    assert camera(k_cam_px=7e-5, focus_distance_m=100_000.0).middle_m == pytest.approx(2.8)
 
 
 def test_a_thumbnail_is_of_the_same_frame() -> None:
