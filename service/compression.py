@@ -72,5 +72,5 @@ def _has_two_forms(status: int, headers: MutableHeaders) -> bool:
     if has_two_forms or status == 304:
         headers.add_vary_header("Accept-Encoding")
     if "etag" in headers:
-        headers["ETag"] = "W/" + headers["ETag"].removeprefix("W/")
+        headers["ETag"] = "W/" + headers["ETag"]
     return has_two_forms

@@ -327,11 +327,8 @@ def _require_usual(directory: TiffDirectory) -> None:
 
 def _has_more_pages(data: bytes, first: TiffDirectory) -> bool:
     """Whether pages follow; a smaller copy of the first is none."""
-    try:
-        pages = [TiffDirectory(data, start) for start in first.following(MOST_DIRECTORIES)]
-        return not all(_is_small_copy(page) for page in pages)
-    except (struct.error, InvalidImage):
-        return False
+    pages = (TiffDirectory(data, start) for start in first.following(MOST_DIRECTORIES))
+    return not all(_is_small_copy(page) for page in pages)
 
 
 def _is_small_copy(page: TiffDirectory) -> bool:
