@@ -196,7 +196,11 @@ def test_listing_goes_through_every_camera_once(client: TestClient, phone: dict[
 
 
 @pytest.mark.parametrize(
-    "query", ["cursor=nonsense", "cursor=ZDIwMA", "cursor=", "cursor=%00", "limit=0", "limit=x", "limit=201"]
+    "query",
+    [
+        *("cursor=nonsense", "cursor=ZDIwMA", "cursor=", "cursor=%00", "cursor=a", "cursor=YWZ0ZXI6YQA"),
+        *("limit=0", "limit=x", "limit=201"),
+    ],
 )
 def test_a_bad_page_is_refused(client: TestClient, query: str) -> None:
     answer = client.get(f"/cameras?{query}")

@@ -211,7 +211,9 @@ def test_format_wins_over_accept(bench: TestClient) -> None:
     assert response.headers["content-type"] == "application/json"
 
 
-@pytest.mark.parametrize("accept", ["text/csv", "image/gif, video/*", "image/png;q=0"])
+@pytest.mark.parametrize(
+    "accept", ["text/csv", "image/gif, video/*", "image/png;q=0", "image/png;q=2", "image/png;q=nan", "image/png;q=x"]
+)
 def test_an_accept_that_nothing_fits_is_406(bench: TestClient, accept: str) -> None:
     refused(ask(bench, headers={"Accept": accept}), 406, "image/png", "application/json")
 

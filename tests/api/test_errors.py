@@ -20,6 +20,7 @@ def require_problem(answer: Any, status: int, kind: str) -> dict[str, Any]:
     assert answer.status_code == status
     assert answer.headers["content-type"] == "application/problem+json"
     assert answer.headers["x-request-id"]
+    assert answer.headers["cache-control"] == "no-store"
     body: dict[str, Any] = answer.json()
     assert body["status"] == status
     assert body["type"] == f"urn:camind:problem:{kind}"
@@ -211,6 +212,13 @@ def test_a_parameter_that_is_unknown_or_sent_twice_is_named(
 def test_a_page_s_address_may_have_any_query(client: TestClient) -> None:
     for path in ("/", "/health/live", "/model", "/web/app.js"):
         assert client.get(f"{path}?from=mail&from=mail").status_code == 200
+
+
+def test_a_field_s_name_is_told_in_short_and_commands_no_terminal(client: TestClient, phone: dict[str, Any]) -> None:
+    answer = client.post("/cameras", json={**phone, f"\x1b[2J{'x' * 9_000}": 1})
+    (fault,) = require_problem(answer, 422, "invalid-request")["errors"]
+    assert fault["pointer"].startswith("#/?[2Jxxx")
+    assert len(fault["pointer"]) < 250
 
 
 def test_a_lone_surrogate_breaks_nothing(client: TestClient) -> None:

@@ -14,7 +14,17 @@ from service.inference.exif import Exif, read_exif
 from service.inference.headers import read_header
 from service.storage.cameras import NAME_PATTERN
 from tests.inference.heics import heic
-from tests.inference.photographs import ExifValue, corners, exif_of, jpeg, png, tiff, webp, with_exif
+from tests.inference.photographs import (
+    ExifValue,
+    corners,
+    exif_of,
+    exif_with_thumbnail,
+    jpeg,
+    png,
+    tiff,
+    webp,
+    with_exif,
+)
 
 MAKE, MODEL = 271, 272
 F_NUMBER, FOCAL, SUBJECT, WIDTH, FOCAL_35, ZOOM, LENS = 0x829D, 0x920A, 0x9206, 0xA002, 0xA405, 0xA404, 0xA434
@@ -52,7 +62,7 @@ def test_a_phone_s_rendering_is_read_and_said(tag: int, rendering: str | None) -
 
 
 def test_text_is_read_without_control_characters_and_no_more_of_it_than_a_name_has() -> None:
-    found = read_exif(exif_of({MAKE: " Ni\x1bkon\n ", MODEL: "D" * 300}, {LENS: "\x07 "}))
+    found = read_exif(exif_of({MAKE: " Ni\x1bkon\n \0left from before", MODEL: "D" * 300}, {LENS: "\x07 "}))
     assert (found.make, found.model, found.lens) == ("Nikon", "D" * 64, None)
 
 
@@ -80,6 +90,15 @@ def test_fractions_with_a_sign_are_read() -> None:
         struct.pack("<HH", F_NUMBER, 5), struct.pack("<HH", F_NUMBER, 10)
     )
     assert read_exif(signed).f_number == 2.8
+
+
+def test_a_place_may_be_told_as_a_directory_s() -> None:
+    place = exif_of({}, {F_NUMBER: (28, 10)}).replace(struct.pack("<HH", 0x8769, 4), struct.pack("<HH", 0x8769, 13))
+    assert read_exif(place).f_number == 2.8
+
+
+def test_a_body_is_read_where_nothing_is_noted_of_the_shot() -> None:
+    assert read_exif(exif_with_thumbnail(b"")) == Exif(make="Maker")
 
 
 def test_numbers_with_a_floating_point_are_read() -> None:
@@ -218,6 +237,7 @@ def test_a_zoomed_picture_s_pixels_are_so_much_smaller_ones_of_the_sensor(tags: 
     assert zoomed.sensor_width_px == whole.sensor_width_px == 3872
     assert whole.pixel_pitch_um is not None
     assert zoomed.pixel_pitch_um == pytest.approx(whole.pixel_pitch_um / 2, rel=1e-3)
+    assert draft(digital_zoom=0.5, **tags).lens == whole  # nothing is zoomed by less than 1
 
 
 @pytest.mark.parametrize("width_px", [None, 400])

@@ -114,8 +114,9 @@ def test_another_aperture_than_k_cam_holds_at_is_told_where_no_lens_is_known() -
 
 
 def test_a_digital_zoom_is_told_of_whatever_the_camera_was_made_from() -> None:
-    (warning,) = taken_otherwise(Exif(digital_zoom=2.0), CAMERA, is_refocused=True)
-    assert "digital zoom of 2" in warning
+    for zoom in (1.05, 2.0):
+        (warning,) = taken_otherwise(Exif(digital_zoom=zoom), CAMERA, is_refocused=True)
+        assert f"digital zoom of {zoom:g}" in warning
     assert not [*taken_otherwise(Exif(digital_zoom=1.0), CAMERA, is_refocused=True)]
 
 

@@ -181,6 +181,14 @@ def test_what_is_transparent_is_hidden(kind: str, dtype: type[np.uint8 | np.uint
     assert np.abs(photograph.rgb.astype(int) - corners()).max() < (20 if kind == ".avif" else 1)
 
 
+def test_what_is_transparent_in_a_lossy_webp_is_hidden() -> None:
+    rgba = np.dstack([corners(), np.full((48, 64), 255, np.uint8)])
+    rgba[:24, :, 3] = 0
+    hidden = read_photograph(encoded(".webp", rgba)).hidden
+    assert hidden is not None
+    np.testing.assert_array_equal(hidden, rgba[..., 3] == 0)
+
+
 def test_alpha_that_hides_nothing_or_all_of_it_says_nothing() -> None:
     for rgba in (np.dstack([corners(), np.full((48, 64), alpha, np.uint8)]) for alpha in (0, 200, 255)):
         photograph = read_photograph(encoded(".png", rgba))
@@ -307,6 +315,16 @@ def test_exif_and_xmp_of_a_jpeg_are_told_apart_in_either_order() -> None:
         assert (header.orientation, header.xmp) == (6, xmp)
 
 
+def test_the_parts_of_a_jpeg_may_have_another_order_and_markers_nothing_behind_them() -> None:
+    data = jpeg(corners())
+    start = data.index(b"\xff\xc0")
+    frame = data[start : start + 2 + int.from_bytes(data[start + 2 : start + 4], "big")]
+    ordered = data.replace(frame, b"", 1).replace(b"\xff\xda", b"\xff\x01" + frame + b"\xff\xda", 1)
+    np.testing.assert_array_equal(read_photograph(ordered).rgb, read_photograph(data).rgb)
+    with pytest.raises(InvalidImage, match="no marker"):
+        read_photograph(data[:start] + b"x" + data[start:])
+
+
 def test_what_stands_behind_the_end_of_a_jpeg_does_no_harm() -> None:
     assert read_photograph(jpeg(corners()) + b"a maker's trailer").rgb.shape == (48, 64, 3)
 
@@ -372,6 +390,8 @@ def test_a_tiff_of_16_bits_that_the_decoder_takes_for_another_is_refused(form: d
     tifffile.imwrite(out, pixels, metadata=None, **form)
     with pytest.raises(UnsupportedKind, match=said):
         read_photograph(out.getvalue())
+    grey = encoded(".tiff", colours[..., 0])
+    assert read_photograph(tiff_with(grey, {284: (3, 1, 2)})).width_px == 32  # of one colour that means nothing
 
 
 def test_bytes_and_pixels_are_limited_before_decoding() -> None:
@@ -422,6 +442,20 @@ def test_a_tile_far_larger_than_its_picture_is_refused() -> None:
     assert entry in data
     with pytest.raises(InvalidImage, match="16x8000000"):
         read_photograph(data.replace(entry, larger))
+
+
+def test_entries_and_values_of_a_tiff_without_end_are_refused() -> None:
+    data = tiff(corners())
+    entries = data[: int.from_bytes(data[4:8], "little")] + b"\xff\xff" + bytes(12 * 65_535 + 4)
+    values = tiff_with(data + bytes(200_000), {330: (1, 200_000, 8)})
+    for hostile, said in ((entries, "65535 entries"), (values, "200000 values")):
+        with pytest.raises(InvalidImage, match=said):
+            read_photograph(hostile)
+    long = struct.pack("<H", 4_096) + bytes(12 * 4_096)
+    often = data + long + struct.pack("<I", len(data)) * 20_000
+    started_s = time.process_time()
+    assert read_photograph(tiff_with(often, {330: (4, 20_000, len(data + long))})).width_px == 64
+    assert time.process_time() - started_s < 1
 
 
 def test_bytes_that_many_parts_of_a_tiff_share_are_decoded_for_none() -> None:
@@ -505,8 +539,10 @@ def test_what_the_lens_was_set_to_is_read_at_once_and_no_damage_stops_it() -> No
     for _ in range(100):
         assert read_exif(exif) == Exif("x" * 40, "y" * 40, focal_length_mm=35.0, f_number=2.8)
     assert time.perf_counter() - started < 0.1
+    picture = jpeg(corners())
     for length in range(len(exif)):
         read_exif(exif[:length])
+        assert read_header(with_exif(picture, exif[:length])).orientation == 1
 
 
 def icc_profile(**tags: bytes) -> bytes:
@@ -526,6 +562,7 @@ PROFILES = {
         icc_profile(rTRC=b"curv" + bytes(4) + b"\x00\x00\x00\x01\x01\x00"),
         icc_profile(rTRC=b"para" + bytes(8) + b"\x00\x01\x00\x00"),
         icc_profile(kTRC=b"curv" + bytes(8)),
+        icc_profile(kTRC=b"curv" + bytes(8)) + bytes(100_000),  # of several parts in a jpeg
         icc_profile(rTRC=b"curv" + bytes(4) + b"\x00\x00\x00\x02\x00\x00\xff\xff"),
     ],
     "HDR by PQ": [
@@ -598,6 +635,7 @@ def test_photographs_of_a_folder_are_known_by_how_cameras_name_them(tmp_path: Pa
     assert [path.name for path in photographs_in(tmp_path)] == ["a.JPG", "b.HIF", "c.heic", "d.NEF", "g.jfif", "h.MPO"]
 
 
+ENDS_ANYWHERE = tiff(corners())[:-4] + b"\xff" * 4  # the next page would be far outside
 KIND_OF_PAGE, OTHER_TAG = (struct.pack("<HHI", tag, 4, 1) for tag in (254, 253))
 
 
@@ -642,6 +680,6 @@ def test_a_small_copy_in_front_is_not_taken_for_the_picture() -> None:
             read_photograph(out.getvalue())
 
 
-@pytest.mark.parametrize("data", [pages(), pages(1), png(corners()), webp(corners())])
+@pytest.mark.parametrize("data", [pages(), pages(1), ENDS_ANYWHERE, png(corners()), webp(corners())])
 def test_of_one_picture_nothing_is_told(data: bytes) -> None:
     assert read_photograph(data).warnings == ()

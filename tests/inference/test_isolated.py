@@ -124,6 +124,8 @@ def test_a_heic_of_another_size_than_stated_is_refused() -> None:
     for stated in ((64, 60), (32, 32)):
         with pytest.raises(InvalidImage):
             read_photograph(heic(stated=stated, crop=None))
+    with pytest.raises(InvalidImage):
+        read_photograph(heic(crop=struct.pack(">8I", 64, 0, 48, 0, 0, 1, 0, 1)))  # 64 noughts wide
 
 
 def test_no_prefix_of_a_heic_gets_past_its_header() -> None:
@@ -166,7 +168,7 @@ def test_an_avif_is_turned_exactly_once(orientation: int) -> None:
 
 def test_an_avif_is_known_by_its_brands_and_its_first_frame_is_read() -> None:
     data = avif(corners())
-    named = data.replace(b"ftypavif", b"ftypmif1", 1)
+    named = data.replace(b"ftypavif", b"ftypmif1", 1).replace(b"avifmif1miaf", b"mif1miafavif", 1)
     assert (read_header(named).kind, read_header(heic().replace(b"ftypheic", b"ftypmif1", 1)).kind) == ("avif", "heic")
     photograph = read_photograph(avif(corners(), 1, corners()[::-1]))
     assert photograph.warnings == ("the file has more than one picture: the first was read",)
