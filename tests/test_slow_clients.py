@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 
 from model_export.started_server import Reply, Server, serving
-from service.middleware import LEAST_BYTES_PER_S
 from tests.inference.photographs import corners, png
 
 DEADLINE_S, SOAK_DEADLINE_S = 2.0, 60.0
@@ -106,8 +105,8 @@ def _takes_a_byte(connection: socket.socket) -> bool:
 
 
 def sent_slowly(server: Server, takes_s: float) -> Reply:
-    """The answer to a photograph that comes at twice the least rate."""
-    chunk = bytes(round(2 * LEAST_BYTES_PER_S * DRIP_S))
+    """The answer to a photograph that comes at twice the least rate, which is 32 kB/s."""
+    chunk = bytes(round(2 * 32_000 * DRIP_S))
 
     def body() -> Iterator[bytes]:
         yield PHOTOGRAPH

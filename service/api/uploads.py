@@ -100,7 +100,7 @@ async def _from_form(request: Request, take: Callable[[int], None]) -> Upload:
     parser.spool_max_size = sys.maxsize
     try:
         form = await parser.parse()
-    except (MultiPartException, KeyError, ValueError) as exc:  # ValueError: of a charset that decodes nothing
+    except (MultiPartException, ValueError) as exc:  # ValueError: of a charset that decodes nothing
         detail = f"The form cannot be read ({exc}): send one file, with a file name, in the field '{FIELD}'."
         raise BadRequest.at(detail, f"#/{FIELD}") from exc
     try:

@@ -231,6 +231,9 @@ def test_a_form_field_is_as_good_as_the_body(bench: TestClient) -> None:
         files = {"image": (name, data, kind)} if kind else {"image": (name, data)}
         response = bench.post("/depth?camera=bench&side=near&format=npy", files=files)
         np.testing.assert_allclose(npy(response), depth_near(LEVEL), rtol=0.01)
+    form = bench.build_request("POST", "/", files=files)
+    kind = form.headers["content-type"].replace("multipart/form-data", "Multipart/Form-Data")
+    assert bench.post("/depth?camera=bench", content=form.read(), headers={"Content-Type": kind}).status_code == 200
 
 
 @pytest.mark.parametrize("make", [jpeg, png, webp, tiff])

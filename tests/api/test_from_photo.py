@@ -32,6 +32,7 @@ def test_a_draft_completed_is_a_camera(client: TestClient) -> None:
 def test_a_form_is_as_good(client: TestClient) -> None:
     answer = client.post(PATH, files={"image": ("a.jpg", PHOTOGRAPH, "image/jpeg")})
     assert answer.json()["name"] == "nikon-d200-35mm-f2.8"
+    assert client.post(PATH, files={"image": ("a.txt", PHOTOGRAPH, "text/plain")}).status_code == 415
 
 
 def test_a_webp_tells_as_much(client: TestClient) -> None:

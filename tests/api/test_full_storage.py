@@ -18,6 +18,7 @@ from starlette.testclient import TestClient
 from service.app import create_app
 from service.config import Settings
 from service.storage.engine import open_engine
+from service.storage.keys import Keys
 from tests.fake_calibration import SETTINGS, FakeCalibration
 from tests.inference.photographs import corners, png
 
@@ -103,6 +104,8 @@ def test_a_full_database_refuses_and_recovers(client: TestClient, fault: Fault, 
 
 def test_a_database_that_takes_no_writes_is_still_read(client: TestClient, fault: Fault, app: FastAPI) -> None:
     assert client.post("/cameras", json=camera("there")).status_code == 201
+    keys = Keys(app.state.engine)
+    _, key = keys.create("robot", "lab")
     fault.is_read_only = True
     replaced = {key: camera("")[key] for key in camera("") if key != "name"}
     for answer in (
@@ -114,6 +117,7 @@ def test_a_database_that_takes_no_writes_is_still_read(client: TestClient, fault
     ):
         assert (answer.status_code, answer.json()["type"]) == (503, UNWRITABLE)
     assert client.get("/cameras/there").status_code == 200
+    assert keys.find(key) is not None
     assert app.state.spool.ids() == []
     fault.is_read_only = False
     assert client.get("/health/ready").status_code == 200

@@ -105,5 +105,13 @@ def test_a_request_is_one_event(client: TestClient, phone: dict[str, Any]) -> No
         ("POST", "/depth", 415),
     ]
     assert [event.get("camera") for event in events] == ["pixel7-wide", "pixel7-wide", None, "pixel7-wide"]
+    assert [event.get("problem") for event in events] == [None, None, "not-found", "unsupported-kind"]
     assert events[0]["request_id"] == "abc"
     assert events[0]["duration_ms"] > 0
+
+
+@pytest.mark.parametrize("path", ["/cameras/", "/depth?camera="])
+def test_what_a_camera_is_called_makes_no_event_long(client: TestClient, path: str) -> None:
+    with structlog.testing.capture_logs() as events:
+        client.get(path + "x" * 5_000)
+    assert len(str(events)) < 500
