@@ -359,9 +359,34 @@ def test_calibrations_that_just_ended_are_not_pruned(bench: Path) -> None:
 
 def test_a_photograph_in_which_nothing_is_seen_has_no_depth(bench: Path) -> None:
     cv2.imwrite(str(bench / "black.png"), np.zeros((48, 64, 3), np.uint8))
-    told = at_once("depth", "black.png", "--camera", "bench")
+    told = at_once("depth", "black.png", "./black.png", "--camera", "bench")
     assert told.exit_code == 1
     assert "has depth of 0 of 1 photographs" in told.stdout
+
+
+def test_a_full_disk_is_said_of_what_has_no_room_and_leaves_no_half_of_it(bench: Path, tiny_model_dir: Path) -> None:
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(name, np.full((48, 64, 3), brightness_for(2.0), np.uint8))
+    (bench / "depth").mkdir()
+    (bench / "depth" / ".a.npy.part").symlink_to("/dev/full")
+    asked = ("a.png", "b.png", "--camera", "bench", "--format", "npy", "--model", str(tiny_model_dir))
+    told = at_once("depth", *asked, "--known", "20,20,1.1")
+    assert told.exit_code == 1
+    assert "No space left" in told.stdout
+    assert [file.name for file in (bench / "depth").iterdir()] == ["b.npy"]
+    focus_m = re.search(r"100% +([0-9.]+)", told.stdout)
+    assert focus_m is not None
+    assert 1 < float(focus_m[1]) < 1.9  # by the known depth, not the camera's
+
+
+def test_too_little_memory_is_said_of_the_photograph(bench: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("service.depth_folder.fulfil", fail)
+    (bench / "a.png").touch()
+    told = at_once("depth", "a.png", "--camera", "bench")
+    assert (told.exit_code, "too little memory" in told.stdout) == (1, True)
 
 
 def test_nothing_is_left_in_the_user_s_home(tmp_path: Path) -> None:
@@ -433,6 +458,8 @@ def test_a_table_tells_photographs_of_any_name_apart(bench: Path, tiny_model_dir
         (("photos", "--camera", "bench", "--maps", "depth"), 2, "maps.0: "),
         (("photos", "--camera", "bench", "--longest-px", "8"), 2, "longest_px: "),
         (("photos", "--camera", "bench", "--out", "photos"), 2, "photos holds photographs"),
+        (("photos", "--camera", "bench", "--out", "empty/../photos"), 2, "photos holds photographs"),
+        (("photos", "--camera", "bench", "--format", "npy", "--format", "gif"), 2, "format: "),
         (("photos", "others/a.jpg", "--camera", "bench"), 2, "would become one file"),
         (("empty", "--camera", "bench"), 2, "no photographs in empty"),
     ],

@@ -262,7 +262,7 @@ def test_a_lens_longer_than_its_focus_distance_is_refused(
 
 
 @pytest.mark.parametrize("place", ["lens", "body"])
-@pytest.mark.parametrize("name", ["focal_length_35mm", "focal_length_in_35mm_film"])
+@pytest.mark.parametrize("name", ["focal_length_35mm", "FocalLengthIn35MM", "EquivalentFocalLength"])
 def test_an_equivalent_focal_length_is_explained(
     client: TestClient, d200: dict[str, Any], place: str, name: str
 ) -> None:

@@ -210,6 +210,7 @@ def test_a_statement_that_takes_too_long_is_busy(hurried: Engine) -> None:
 
 
 def test_a_server_that_stands_still_is_not_ready(hurried: Engine) -> None:
+    schema.upgrade(hurried)  # which waits for as long as it takes, and nothing after it on the same connection
     with reading(hurried) as session:
         backend = session.connection().exec_driver_sql("SELECT pg_backend_pid()").scalar_one()
         try:

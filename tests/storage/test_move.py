@@ -1,5 +1,6 @@
 """From SQLite to PostgreSQL: every row comes out as it went in, and counting goes on behind it."""
 
+import threading
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any
 import pytest
 from pydantic import JsonValue
 from sqlalchemy import JSON, Engine, Text, cast, select
+from sqlalchemy.exc import DatabaseError
 from typer.testing import CliRunner, Result
 
 from service import cli
@@ -154,6 +156,24 @@ def test_all_rows_come_or_none(file: Path, server: Engine) -> None:
     with pytest.raises(Exception, match="check"):
         moved(file, server)
     assert not any(rows_of(server).values())
+
+
+def test_who_writes_is_waited_for_and_nobody_does_meanwhile(file: Path, postgres_url: str) -> None:
+    engine = open_engine(f"{postgres_url}&options=-c%20lock_timeout%3D50")
+    schema.upgrade(engine)
+    writer = engine.connect()
+    writer.exec_driver_sql("LOCK TABLE cameras IN ROW EXCLUSIVE MODE")
+    ending = threading.Timer(1, writer.close)
+    ending.start()
+
+    def write(*_: int) -> None:
+        with engine.connect() as other, pytest.raises(DatabaseError, match="could not obtain lock"):
+            other.exec_driver_sql("LOCK TABLE api_keys IN ROW EXCLUSIVE MODE NOWAIT")
+
+    move(file, engine, file.with_name("camind.sqlite3"), None, write)
+    ending.join()
+    assert all(rows_of(engine).values())
+    engine.dispose()
 
 
 def test_an_older_backup_comes_to_the_newest_schema(file: Path, server: Engine) -> None:
