@@ -307,8 +307,7 @@ def _tiff(data: bytes) -> Header:
 
 def _has_alpha(directory: TiffDirectory) -> bool:
     is_rgba = len(directory.values(TIFF_BITS)) == TIFF_RGBA_SAMPLES and TIFF_RGB in directory.values(TIFF_PHOTOMETRIC)
-    is_interleaved = 2 not in directory.values(TIFF_PLANAR)
-    return is_rgba and is_interleaved and not TIFF_ALPHA.isdisjoint(directory.values(TIFF_EXTRA_SAMPLES))
+    return is_rgba and not TIFF_ALPHA.isdisjoint(directory.values(TIFF_EXTRA_SAMPLES))
 
 
 def _require_usual(directory: TiffDirectory) -> None:

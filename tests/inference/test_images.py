@@ -181,12 +181,15 @@ def test_what_is_transparent_is_hidden(kind: str, dtype: type[np.uint8 | np.uint
     assert np.abs(photograph.rgb.astype(int) - corners()).max() < (20 if kind == ".avif" else 1)
 
 
-def test_what_is_transparent_in_a_lossy_webp_is_hidden() -> None:
+def test_what_is_transparent_in_a_lossy_webp_or_a_tiff_of_planes_is_hidden() -> None:
     rgba = np.dstack([corners(), np.full((48, 64), 255, np.uint8)])
     rgba[:24, :, 3] = 0
-    hidden = read_photograph(encoded(".webp", rgba)).hidden
-    assert hidden is not None
-    np.testing.assert_array_equal(hidden, rgba[..., 3] == 0)
+    planes, form = BytesIO(), {"photometric": "rgb", "planarconfig": "separate", "extrasamples": ["unassalpha"]}
+    tifffile.imwrite(planes, np.moveaxis(rgba, 2, 0), metadata=None, **form)
+    for data in (encoded(".webp", rgba), planes.getvalue()):
+        hidden = read_photograph(data).hidden
+        assert hidden is not None
+        np.testing.assert_array_equal(hidden, rgba[..., 3] == 0)
 
 
 def test_alpha_that_hides_nothing_or_all_of_it_says_nothing() -> None:
