@@ -134,6 +134,7 @@ def test_without_keys_another_site_s_page_changes_nothing(
         ("stranger.example:8000", False),
         ("camind.example.org.stranger.example", False),
         ("localhost.stranger.example", False),
+        ("rig.local.stranger.example", False),
         ("127.0.0.1.stranger.example:8000", False),
         ("127.0.0.1@stranger.example", False),
         ("stranger.example#.local", False),
@@ -180,6 +181,11 @@ def test_every_path_but_health_and_the_page_asks_for_a_key(app: FastAPI, client:
 def test_what_is_no_key_lets_nobody_in(client: TestClient, words: str) -> None:
     for more in ({}, ASKED_BEFOREHAND):
         refused(client.get("/cameras", headers={"Authorization": words, **more}), 401, "unauthorized")
+
+
+def test_a_scheme_may_be_written_in_any_way(client: TestClient, keys: Keys) -> None:
+    key = bearer(keys, "lab")["Authorization"].removeprefix("Bearer ")
+    assert client.get("/cameras", headers={"Authorization": f"bearer  {key}"}).status_code == 200
 
 
 def test_a_key_opens_what_its_scope_names_and_nothing_else(app: FastAPI, client: TestClient, keys: Keys) -> None:
@@ -353,6 +359,19 @@ def test_a_key_has_its_own_quota(settings: Settings) -> None:
         assert 1 <= int(answer.headers["retry-after"]) <= 60
         assert client.get("/cameras", headers=other).status_code == 200
         assert client.get("/health/ready").status_code == 200
+        refused_anyway = bearer(app.state.keys, "lab", "depth")
+        assert [client.get("/cameras", headers=refused_anyway).status_code for _ in range(4)] == [403, 403, 403, 429]
+
+
+def test_who_waits_as_long_as_the_quota_says_is_let_in(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = time.time()
+    monkeypatch.setattr(time, "time", lambda: now_s)
+    with TestClient(create_app(settings.model_copy(update={"key_requests_per_minute": 1}))) as client:
+        key = bearer(client.app.state.keys, "robot")
+        assert client.get("/cameras", headers=key).status_code == 200
+        now_s += 10.5
+        now_s += int(client.get("/cameras", headers=key).headers["retry-after"])
+        assert client.get("/cameras", headers=key).status_code == 200
 
 
 def test_a_clock_that_is_set_back_keeps_nobody_out(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -490,6 +509,14 @@ ELSEWHERE = "https://app.example.org"
 ASKED_BEFOREHAND = {"Origin": ELSEWHERE, "Access-Control-Request-Method": "POST"}
 
 
+def documented_headers(app: FastAPI) -> set[str]:
+    """Those that any answer may have."""
+    answers = [
+        each for item in app.openapi()["paths"].values() for way in item.values() for each in way["responses"].values()
+    ]
+    return {name for answer in answers for name in answer.get("headers", {})}
+
+
 @pytest.mark.parametrize("origins", ["", f"https://other.example, {ELSEWHERE}"])
 def test_a_page_of_an_origin_that_is_named_may_ask_with_a_key_and_no_other(settings: Settings, origins: str) -> None:
     is_named = bool(origins)
@@ -505,6 +532,8 @@ def test_a_page_of_an_origin_that_is_named_may_ask_with_a_key_and_no_other(setti
             assert answer.headers.get("access-control-allow-origin") == (ELSEWHERE if is_named else None)
             assert ("Origin" in answer.headers.get("vary", "")) == is_named
         assert ("Authorization" in beforehand.headers.get("access-control-allow-headers", "")) == is_named
+        exposed = beforehand.headers.get("access-control-expose-headers", "").split(", ")
+        assert (documented_headers(app) <= set(exposed)) == is_named
         assert (
             "access-control-allow-origin"
             not in client.get("/cameras", headers={"Origin": "https://evil.example"}).headers

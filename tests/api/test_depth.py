@@ -19,6 +19,8 @@ from httpx2 import Response
 from numpy.typing import NDArray
 from starlette.testclient import TestClient
 
+from service.app import create_app
+from service.config import Settings
 from service.inference.cancellation import Cancellation
 from service.inference.encode import MAPS, MEDIA_TYPES
 from service.inference.worker import Worker
@@ -565,6 +567,19 @@ def test_a_full_queue_is_503_with_retry_after(app: FastAPI, bench: TestClient) -
     release.set()
     assert held.result(10).value
     assert ask(bench).status_code == 200
+
+
+def test_who_waits_for_a_slot_longer_than_a_body_may_take_is_answered(settings: Settings) -> None:
+    app, release = create_app(settings.model_copy(update={"receive_deadline_s": 0.5})), threading.Event()
+    with TestClient(app) as client:
+        client.post("/cameras", json=CAMERA)
+        assert client.portal is not None
+        held = client.portal.start_task_soon(app.state.worker.run, None, lambda _: release.wait(10))
+        while not app.state.worker.in_flight:
+            pass
+        threading.Timer(0.8, release.set).start()
+        assert ask(client).status_code == 200
+        assert held.result(10).value
 
 
 def replace_worker(app: FastAPI, deadline_s: float) -> Worker:

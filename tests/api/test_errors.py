@@ -122,6 +122,7 @@ def test_json_may_say_more_of_itself(client: TestClient, phone: dict[str, Any], 
 def test_too_many_bytes_are_refused_by_their_stated_length(client: TestClient, settings: Settings) -> None:
     content = b" " * (settings.max_json_bytes + 1)
     body = require_problem(client.post("/cameras", content=content, headers=JSON), 413, "too-large")
+    require_problem(client.post("/cameras", content=content[1:], headers=JSON), 422, "invalid-request")
     assert str(settings.max_json_bytes) in body["detail"]
 
 

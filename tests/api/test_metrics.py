@@ -1,6 +1,7 @@
 """What ``GET /metrics`` says of requests, queues, slots, calibrations, refusals and the process when it is asked."""
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
@@ -51,7 +52,7 @@ def test_metrics_count_by_path_template(client: TestClient, phone: dict[str, Any
     client.get("/wp-admin")
     client.request("BREW", "/coffee")
     answer = client.get("/metrics")
-    assert answer.headers["content-type"].startswith("text/plain")
+    assert answer.headers["content-type"].startswith("text/plain; version=")
     lines = answer.text.splitlines()
     assert 'camind_requests_total{method="GET",path="/cameras/{name}",status="200"} 1.0' in lines
     assert 'camind_requests_total{method="GET",path="/cameras/{name}",status="404"} 2.0' in lines
@@ -98,6 +99,16 @@ def test_a_wait_is_told_of_refused_photographs_too(client: TestClient, phone: di
     )
     assert answer.status_code == 422
     assert figure(client, "camind_depth_queue_wait_seconds_count") == 1
+
+
+def test_the_time_of_each_stage_is_told_in_seconds(client: TestClient, phone: dict[str, Any]) -> None:
+    client.post("/cameras", json=phone)
+    started_s = time.perf_counter()
+    answer = client.post("/depth?camera=pixel7-wide", content=png(corners()), headers={"Content-Type": "image/png"})
+    took_s = time.perf_counter() - started_s
+    assert answer.status_code == 200
+    stages = ("decode", "wait", "blur", "correct", "depth", "encode")
+    assert 0 < sum(figure(client, "camind_depth_stage_seconds_sum", stage=stage) for stage in stages) < took_s
 
 
 def test_calibrations_are_counted_by_state(client: TestClient, app: FastAPI) -> None:

@@ -128,6 +128,14 @@ def test_a_heic_of_another_size_than_stated_is_refused() -> None:
         read_photograph(heic(crop=struct.pack(">8I", 64, 0, 48, 0, 0, 1, 0, 1)))  # 64 noughts wide
 
 
+def test_a_box_may_end_with_the_file_or_tell_its_size_in_64_bits() -> None:
+    data = heic(3)
+    content = data[data.index(b"mdat") + 4 :]
+    before = data[: -len(content) - 8]
+    for head in (struct.pack(">I4s", 0, b"mdat"), struct.pack(">I4sQ", 1, b"mdat", 16 + len(content))):
+        assert read_header(before + head + content) == read_header(data)
+
+
 def test_no_prefix_of_a_heic_gets_past_its_header() -> None:
     data = heic(3)
     for length in range(12, len(data) - 1):

@@ -40,6 +40,13 @@ def test_each_takes_its_own_photographs_without_any_setting() -> None:
         assert draft.camera.image_width_px * draft.camera.image_height_px <= limit, draft.name
 
 
+def test_each_is_a_whole_sensor_s_and_knows_its_aperture() -> None:
+    for draft in seed_drafts():
+        shape = draft.camera.image_width_px / draft.camera.image_height_px
+        assert shape == pytest.approx(4 / 3 if draft.name.startswith("pixel") else 3 / 2, rel=0.01)
+        assert draft.name.endswith(f"-f{draft.camera.f_number:g}")
+
+
 def test_phones_have_the_k_cam_of_their_real_lenses() -> None:
     wide, telephoto = seed_drafts()[-2:]
     assert wide.lens is not None
@@ -55,4 +62,6 @@ def test_seeding_twice_adds_once(cameras: Cameras) -> None:
     changed = cameras.get("nikon-d7500-50mm-f1.8")
     cameras.replace(changed.draft)
     assert seed(cameras) == []
+    cameras.delete("nikon-d7500-55mm-f5.6")
+    assert seed(cameras) == ["nikon-d7500-55mm-f5.6"]
     assert cameras.get("nikon-d7500-50mm-f1.8").revision == 2
