@@ -218,5 +218,5 @@ def _unknown_field(source: str, *path: str) -> str:
 
 
 def printable(part: object) -> str:
-    """Text that is safe in JSON and short: control characters and lone surrogates become question marks."""
-    return re.sub(r"[\x00-\x1f\x7f\ud800-\udfff]", "?", str(part))[:200]
+    """Text that commands no terminal, and is short: control characters become question marks."""
+    return re.sub(r"[\x00-\x1f\x7f]", "?", str(part))[:200]
