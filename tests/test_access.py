@@ -366,8 +366,9 @@ def test_a_key_has_its_own_quota(settings: Settings) -> None:
 def test_who_waits_as_long_as_the_quota_says_is_let_in(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = time.time()
     monkeypatch.setattr(time, "time", lambda: now_s)
-    with TestClient(create_app(settings.model_copy(update={"key_requests_per_minute": 1}))) as client:
-        key = bearer(client.app.state.keys, "robot")
+    app = create_app(settings.model_copy(update={"key_requests_per_minute": 1}))
+    with TestClient(app) as client:
+        key = bearer(app.state.keys, "robot")
         assert client.get("/cameras", headers=key).status_code == 200
         now_s += 10.5
         now_s += int(client.get("/cameras", headers=key).headers["retry-after"])

@@ -184,7 +184,8 @@ def test_what_is_transparent_is_hidden(kind: str, dtype: type[np.uint8 | np.uint
 def test_what_is_transparent_in_a_lossy_webp_or_a_tiff_of_planes_is_hidden() -> None:
     rgba = np.dstack([corners(), np.full((48, 64), 255, np.uint8)])
     rgba[:24, :, 3] = 0
-    planes, form = BytesIO(), {"photometric": "rgb", "planarconfig": "separate", "extrasamples": ["unassalpha"]}
+    planes = BytesIO()
+    form: dict[str, Any] = {"photometric": "rgb", "planarconfig": "separate", "extrasamples": ["unassalpha"]}
     tifffile.imwrite(planes, np.moveaxis(rgba, 2, 0), metadata=None, **form)
     for data in (encoded(".webp", rgba), planes.getvalue()):
         hidden = read_photograph(data).hidden
