@@ -169,6 +169,7 @@ def test_a_fault_is_told_in_words_and_not_by_a_pattern(
     (fault,) = require_problem(client.post("/cameras", json={**phone, **changes}), 422, "invalid-request")["errors"]
     assert fault["pointer"] == f"#/{next(iter(changes))}"
     assert words in fault["detail"]
+    assert "error" not in fault["detail"]
 
 
 def test_headers_and_parameters_are_told_of_in_words_too(client: TestClient, phone: dict[str, Any]) -> None:
