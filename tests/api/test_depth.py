@@ -570,14 +570,19 @@ def test_a_full_queue_is_503_with_retry_after(app: FastAPI, bench: TestClient) -
 
 
 def test_who_waits_for_a_slot_longer_than_a_body_may_take_is_answered(settings: Settings) -> None:
-    app, release = create_app(settings.model_copy(update={"receive_deadline_s": 0.5})), threading.Event()
+    app = create_app(settings.model_copy(update={"receive_deadline_s": 2.0}))
+    is_held, release = threading.Event(), threading.Event()
     with TestClient(app) as client:
         client.post("/cameras", json=CAMERA)
         assert client.portal is not None
-        held = client.portal.start_task_soon(app.state.worker.run, None, lambda _: release.wait(10))
-        while not app.state.worker.in_flight:
-            pass
-        threading.Timer(0.8, release.set).start()
+
+        def hold(_: object) -> bool:
+            is_held.set()
+            return release.wait(10)
+
+        held = client.portal.start_task_soon(app.state.worker.run, None, hold)
+        assert is_held.wait(10)
+        threading.Timer(2.3, release.set).start()
         assert ask(client).status_code == 200
         assert held.result(10).value
 
