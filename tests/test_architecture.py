@@ -31,7 +31,7 @@ import service.app, service.cli, service.config
 """
 LATE_SCIPY = """
 import sys
-import service.app, service.cli, service.depth_folder
+import service.app, service.cli, service.commands.depth_folder
 assert not [name for name in sys.modules if name.split(".")[0] == "scipy"]
 
 import service.calibration.look

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.calibration_folder import pictures_in
+from service.commands.calibration_folder import pictures_in
 from service.errors import InvalidImage
 from service.inference.images import ImageLimits
 from service.opencv import cv2

@@ -383,7 +383,7 @@ def test_too_little_memory_is_said_of_the_photograph(bench: Path, monkeypatch: p
     def fail(*_: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr("service.depth_folder.fulfil", fail)
+    monkeypatch.setattr("service.commands.depth_folder.fulfil", fail)
     (bench / "a.png").touch()
     told = at_once("depth", "a.png", "--camera", "bench")
     assert (told.exit_code, "too little memory" in told.stdout) == (1, True)

@@ -13,6 +13,7 @@ from sqlalchemy.exc import DatabaseError
 from typer.testing import CliRunner, Result
 
 from service import cli
+from service.commands.serve import require_key
 from service.config import Settings
 from service.errors import Conflict, NotReady
 from service.optics.camera import Camera, Intrinsics, Lens
@@ -190,7 +191,7 @@ def test_a_database_without_tables_is_migrated_first(file: Path, postgres_url: s
     with pytest.raises(NotReady, match=told):
         moved(file, engine)
     with pytest.raises(NotReady, match=told):
-        cli._require_key(Settings(), engine)
+        require_key(Settings(), engine)
     engine.dispose()
 
 
