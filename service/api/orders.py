@@ -9,9 +9,10 @@ from service.api.uploads import Upload
 from service.errors import BadRequest
 from service.inference.cancellation import Cancellation
 from service.inference.depth_map import DepthMap
-from service.inference.encode import ENCODERS, MAPS, MEDIA_TYPES, Beside, Encoded, pixel_at, read_point, spread_of
+from service.inference.encode import ENCODERS, MAPS, MEDIA_TYPES, Beside, Encoded
 from service.inference.estimator import Estimator
 from service.inference.exif import Exif
+from service.inference.figures import pixel_at, read_point, spread_of
 from service.inference.frame import (
     camera_of,
     maybe_another_part,

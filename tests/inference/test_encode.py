@@ -23,9 +23,8 @@ from service.inference.encode import (
     encode_png,
     encode_preview,
     encode_tiff,
-    read_point,
-    spread_of,
 )
+from service.inference.figures import read_point, spread_of
 from service.inference.png import grey_png
 from service.inference.preview import render_preview
 from service.inference.resampling import Lines

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from playwright.sync_api import Browser, Locator, Page, Position, Route, expect
 
 from model_export.started_server import Server, serving
-from service.inference.encode import UNDISTORTING
+from service.inference.rays import UNDISTORTING
 from tests.inference import photographs
 from tests.web.chromium import program
 from tests.web.steps import OVERFLOW, change, eventually
