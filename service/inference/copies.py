@@ -3,7 +3,8 @@
 It is one set of raw maps: what is strongly blurred is read on a smaller copy than all else.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +14,10 @@ from service.inference.hypotheses import doubted
 from service.inference.pair import RawMaps
 from service.inference.part import Part
 from service.inference.resampling import Ratio, bands, sample
-from service.opencv import cv2, log
+from service.opencv import cv2, exp, log
 from service.optics import thin_lens
 from service.optics.camera import Camera
+from service.optics.focus import likely_gamma
 
 # of gamma, and of the pixels: what is read too sharp of scenes whose gamma is known is no more
 CLEARLY_SHARPER, SHARPER_FRACTION = 0.7, 0.1
@@ -64,6 +66,19 @@ class Read:
         return thin_lens.gamma_before_averaging(
             float(np.quantile(blur_px, SHARPEST)), self.area.width_px, self.camera.image_width_px
         )
+
+    def softened(self) -> Self:
+        """By the camera with the gamma that the photograph likely has, by its sharpest parts; maps are written over."""
+        camera, maps = self.camera, self.maps
+        gamma_px = likely_gamma(camera.gamma_px, float(np.quantile(maps["blur_px"], SHARPEST)))
+        if gamma_px == camera.gamma_px:
+            return self
+        for rows in bands(maps["blur_px"].shape):
+            for name, side in (("log_ratio_near", 1), ("log_ratio_far", -1)):
+                defocus = side * (exp(-maps[name][rows]) - 1)
+                less = thin_lens.relative_defocus_if_softer(defocus, camera.gamma_px, gamma_px, camera.k_cam_px)
+                maps[name][rows] = -log(1 + side * less)
+        return replace(self, camera=replace(camera, gamma_px=gamma_px))
 
     def maps_from(self, inner: Part) -> RawMaps:
         """The maps, as views, from where an area within this one begins."""

@@ -220,8 +220,10 @@ class Estimator:
         (low, high), (nearest, farthest) = SIDE_RANGES[request.side], self.manifest.ranges.depth_ratio
         limits_m = max(low, nearest) * read.camera.focus_distance_m, min(high, farthest) * read.camera.focus_distance_m
 
-        if request.side == "auto":
-            with request.stopwatch.stage("correct"):
+        with request.stopwatch.stage("correct"):
+            if clues is None:
+                read = read.softened()
+            if request.side == "auto":
                 read.doubt_in_focus()
 
         def reading() -> Reading:

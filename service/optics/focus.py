@@ -29,6 +29,9 @@ LEAST_STEPS, FINER_STEPS, MOST_PASSES = 10, 24, 4
 FOR_INFINITY_M = tuple(NEAREST_FOR_INFINITY_M * 100 / step for step in range(1, 100))
 GAMMA_RATIOS = tuple(FARTHEST_OFF ** (step / 6) for step in sorted(range(-6, 7), key=abs))
 LEAST_BLUR_PX = 0.1
+# times as likely that nothing of a photograph is in focus as that its sharpest parts are, where these show the gamma
+# that was told: one in two has something in focus, and of the other the sharpest is anything up to 20 gammas
+NOTHING_IN_FOCUS = TOLD_GAMMA_ERROR * math.sqrt(2 * math.pi) / math.log(20)
 CONFIDENCE_95 = 1.92  # half of the 95 % quantile of chi squared with one degree of freedom
 
 
@@ -181,6 +184,18 @@ class _Search:
             else math.log(focus_m / told_m) / TOLD_ERROR
         )
         return _loss(off_told) + sum(map(_loss, off_side))
+
+
+def likely_gamma(told_px: float, sharpest_px: float) -> float:
+    """gamma of a photograph, told for its camera, whose sharpest parts show a blur of ``sharpest_px``; never less.
+
+    Either these are in focus, and what they show is gamma, which is as likely as it is near what was told; or nothing
+    is, and gamma is as told: the mean of its logarithm. A photograph is often softer than its camera is where one
+    measures that, and what is in it softer than ink on paper.
+    """
+    softer = math.log(max(sharpest_px, told_px) / told_px) if told_px else 0.0
+    in_focus = math.exp(-((softer / TOLD_GAMMA_ERROR) ** 2) / 2)
+    return told_px * math.exp(softer * in_focus / (in_focus + NOTHING_IN_FOCUS))
 
 
 def _suited(camera: Camera, sightings: Sequence[Sighting]) -> Iterator[float]:

@@ -135,6 +135,18 @@ def relative_defocus_from_blur(blur_px: Q, gamma_px: Q | float, k_cam_px: Q | fl
     return defocus_from_blur(blur_px, gamma_px, floor_px) / k_cam_px
 
 
+def relative_defocus_if_softer(relative_defocus: Q, gamma_px: float, softer_px: float, k_cam_px: float) -> Q:
+    """x where gamma is ``softer_px``, from the x that was found by ``gamma_px``, which is no more than that.
+
+    x^2 - (softer^2 - gamma^2) / k_cam^2 (eq. 7), whose positive part is smoothed over what is taken away: what is about
+    as blurred as the softer gamma is close to focus, and not all in it. Never more than it was.
+    """
+    taken = (softer_px**2 - gamma_px**2) / k_cam_px**2
+    variance = relative_defocus * relative_defocus - taken
+    less = ((variance + (variance * variance + taken**2) ** 0.5) / 2.0) ** 0.5
+    return (relative_defocus + less - abs(relative_defocus - less)) / 2.0
+
+
 def relative_defocus_spread(
     blur_px: Q, relative_error: Q, gamma_px: Q | float, k_cam_px: Q | float, floor_px: float = 0.0
 ) -> Q:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.optics.camera import Camera
-from service.optics.focus import FARTHEST_OFF, FocusFit, Sighting, fit_focus
+from service.optics.focus import FARTHEST_OFF, FocusFit, Sighting, fit_focus, likely_gamma
 
 CAMERA = Camera(640, 480, 2.0, 3.81, 0.5, focal_length_m=0.05)
 DEPTHS_M = (0.8, 1.2, 1.5, 2.5, 3.5)
@@ -171,3 +171,18 @@ def test_a_lens_at_infinity_is_left_there() -> None:
     fit = fitted(100_000.0, 0.5, 0.8, 1.2, told=Camera(640, 480, 100_000.0, 7.6e-5, 0.5))
     assert fit.focus_distance_m == fit.high_m == 100_000.0
     assert fit.low_m < 50
+
+
+@given(st.floats(0.2, 2.0), st.floats(0.01, 100.0))
+def test_a_photograph_s_gamma_lies_between_what_is_told_and_what_is_sharpest(told_px: float, times: float) -> None:
+    gamma_px = likely_gamma(told_px, times * told_px)
+    assert told_px <= gamma_px * (1 + 1e-12)
+    assert gamma_px <= max(told_px, times * told_px) * (1 + 1e-12)
+
+
+def test_what_is_hardly_softer_than_gamma_is_gamma_and_what_is_much_softer_is_not() -> None:
+    assert likely_gamma(0.5, 0.55) == pytest.approx(0.5 * 1.1**0.8, rel=0.01)
+    assert likely_gamma(0.5, 2.0) == pytest.approx(0.5, rel=1e-3)
+    assert likely_gamma(0.5, 0.4) == 0.5
+    assert likely_gamma(0.0, 0.4) == 0.0
+    assert likely_gamma(1e-6, 60.0) == 1e-6

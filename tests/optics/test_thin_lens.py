@@ -215,3 +215,18 @@ def test_far_from_gamma_the_spread_of_defocus_is_the_error_of_blur(blur_px: floa
     k_cam_px, error = 4.0, 0.05
     spread = thin_lens.relative_defocus_spread(blur_px, error, 0.3, k_cam_px)
     assert spread == pytest.approx(error * blur_px / k_cam_px, rel=0.03)
+
+
+@given(st.just(0.0) | st.floats(1e-3, 5.0), st.floats(0.2, 2.0), st.floats(1.01, 2.0), st.floats(0.3, 30.0))
+def test_by_a_softer_gamma_defocus_is_less_and_never_nothing(x: float, gamma: float, times: float, k: float) -> None:
+    less = thin_lens.relative_defocus_if_softer(x, gamma, times * gamma, k)
+    blur_px = thin_lens.blur_from_defocus(x * k, gamma)
+    assert thin_lens.relative_defocus_from_blur(blur_px, times * gamma, k) - 1e-7 <= less <= x * (1 + 1e-9)
+    assert less > 0 or x == 0
+    # much out of focus it is what eq. 7 says
+    if blur_px > 4 * times * gamma:
+        assert less == pytest.approx(thin_lens.relative_defocus_from_blur(blur_px, times * gamma, k), rel=5e-3)
+
+
+def test_what_a_network_puts_beyond_focus_stays_there() -> None:
+    assert thin_lens.relative_defocus_if_softer(-0.02, 0.5, 0.6, 4.0) == pytest.approx(-0.02)
