@@ -3,6 +3,7 @@
 It is one set of raw maps: what is strongly blurred is read on a smaller copy than all else.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -23,6 +24,7 @@ from service.optics.focus import likely_gamma
 CLEARLY_SHARPER, SHARPER_FRACTION = 0.7, 0.1
 MAY_BE_SHARPER_PX = 0.6  # nothing is read as sharper than 0.42 px (docs/findings.md)
 SHARPEST = 0.05  # of the pixels, as sharp as whose gamma then is taken to be
+SAMPLES = 2**16
 OCTAVES = np.float32(1 / np.log(2))
 
 
@@ -70,7 +72,8 @@ class Read:
     def softened(self) -> Self:
         """By the camera with the gamma that the photograph likely has, by its sharpest parts; maps are written over."""
         camera, maps = self.camera, self.maps
-        gamma_px = likely_gamma(camera.gamma_px, float(np.quantile(maps["blur_px"], SHARPEST)))
+        every = math.ceil(math.sqrt(maps["blur_px"].size / SAMPLES))
+        gamma_px = likely_gamma(camera.gamma_px, float(np.quantile(maps["blur_px"][::every, ::every], SHARPEST)))
         if gamma_px == camera.gamma_px:
             return self
         for rows in bands(maps["blur_px"].shape):

@@ -136,15 +136,14 @@ def relative_defocus_from_blur(blur_px: Q, gamma_px: Q | float, k_cam_px: Q | fl
 
 
 def relative_defocus_if_softer(relative_defocus: Q, gamma_px: float, softer_px: float, k_cam_px: float) -> Q:
-    """x where gamma is ``softer_px``, from the x that was found by ``gamma_px``, which is no more than that.
+    """x where gamma is ``softer_px``, from the x that was found by ``gamma_px``, which is less than that.
 
-    x^2 - (softer^2 - gamma^2) / k_cam^2 (eq. 7), whose positive part is smoothed over what is taken away: what is about
-    as blurred as the softer gamma is close to focus, and not all in it. Never more than it was.
+    Where x^2 is much more than d = (softer^2 - gamma^2) / k_cam^2, d less (eq. 7). Else x^2 / (x^2 + d) of it, as of a
+    signal with noise of that variance (Wiener): what is about as blurred as the softer gamma is close to focus, and not
+    all in it. The sign of x stays.
     """
-    taken = (softer_px**2 - gamma_px**2) / k_cam_px**2
-    variance = relative_defocus * relative_defocus - taken
-    less = ((variance + (variance * variance + taken**2) ** 0.5) / 2.0) ** 0.5
-    return (relative_defocus + less - abs(relative_defocus - less)) / 2.0
+    noise = (softer_px**2 - gamma_px**2) / k_cam_px**2
+    return relative_defocus * abs(relative_defocus) / (relative_defocus * relative_defocus + noise) ** 0.5
 
 
 def relative_defocus_spread(

@@ -192,7 +192,7 @@ def test_what_is_sharpest_is_in_focus_if_it_is_about_as_sharp_as_gamma(estimator
     assert answer.warnings == ()
     # by the gamma that was told 1.9 m, by what is shown 2
     x = thin_lens.relative_defocus_from_blur(softer_px, CAMERA.gamma_px, CAMERA.k_cam_px)
-    assert 2 - answer.depth_m[0, 10] < 0.7 * (2 - thin_lens.depth_near(x, 2.0))
+    assert 2 - answer.depth_m[0, 10] < 0.75 * (2 - thin_lens.depth_near(x, 2.0))
     np.testing.assert_allclose(answer.depth_m[:, 56:], thin_lens.depth_near(expected_x(blurred), 2.0), rtol=2e-3)
 
 

@@ -221,12 +221,10 @@ def test_far_from_gamma_the_spread_of_defocus_is_the_error_of_blur(blur_px: floa
 def test_by_a_softer_gamma_defocus_is_less_and_never_nothing(x: float, gamma: float, times: float, k: float) -> None:
     less = thin_lens.relative_defocus_if_softer(x, gamma, times * gamma, k)
     blur_px = thin_lens.blur_from_defocus(x * k, gamma)
-    assert thin_lens.relative_defocus_from_blur(blur_px, times * gamma, k) - 1e-7 <= less <= x * (1 + 1e-9)
+    assert thin_lens.relative_defocus_from_blur(blur_px, times * gamma, k) - 1e-7 <= less <= x
     assert less > 0 or x == 0
     # much out of focus it is what eq. 7 says
-    if blur_px > 4 * times * gamma:
-        assert less == pytest.approx(thin_lens.relative_defocus_from_blur(blur_px, times * gamma, k), rel=5e-3)
-
-
-def test_what_a_network_puts_beyond_focus_stays_there() -> None:
-    assert thin_lens.relative_defocus_if_softer(-0.02, 0.5, 0.6, 4.0) == pytest.approx(-0.02)
+    if blur_px > 5 * times * gamma:
+        assert less == pytest.approx(thin_lens.relative_defocus_from_blur(blur_px, times * gamma, k), rel=1e-2)
+    # what a network puts beyond focus stays there
+    assert thin_lens.relative_defocus_if_softer(-x, gamma, times * gamma, k) == -less
