@@ -24,7 +24,7 @@ from service.optics.focus import likely_gamma
 CLEARLY_SHARPER, SHARPER_FRACTION = 0.7, 0.1
 MAY_BE_SHARPER_PX = 0.6  # nothing is read as sharper than 0.42 px (docs/findings.md)
 SHARPEST = 0.05  # of the pixels, as sharp as whose gamma then is taken to be
-SAMPLES = 2**16
+SAMPLES = 2**16  # cells that are looked at for them: all of a large photograph would take long
 OCTAVES = np.float32(1 / np.log(2))
 
 
