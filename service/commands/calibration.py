@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from service.commands.failures import WRONG_USE, failure, plain_failures
-from service.commands.opened import Owner, ready_engine, settings_with
+from service.commands.opened import ready_engine, settings_with
+from service.commands.options import Owner
 from service.errors import BadRequest
 from service.optics.camera import FOCUS_DISTANCES_M
 from service.principal import LOCAL

@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from service.commands.opened import MOST_DAYS, ready_engine
+from service.commands.opened import ready_engine
+from service.commands.options import MOST_DAYS
 
 app = typer.Typer(help="The calibrations in the database.", no_args_is_help=True)
 

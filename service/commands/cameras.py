@@ -6,7 +6,8 @@ import typer
 from sqlalchemy import Engine
 
 from service.commands.failures import WRONG_USE, failure, plain_failures
-from service.commands.opened import Owner, ready_engine
+from service.commands.opened import ready_engine
+from service.commands.options import Owner
 from service.errors import Conflict, NotFound
 from service.principal import LOCAL
 

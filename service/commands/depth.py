@@ -7,7 +7,8 @@ import typer
 
 from service.commands.cameras import stored_camera
 from service.commands.failures import WRONG_USE, failure, plain_failures
-from service.commands.opened import Owner, ready_engine, settings_with
+from service.commands.opened import ready_engine, settings_with
+from service.commands.options import Owner
 from service.memory import lasting
 from service.principal import LOCAL
 

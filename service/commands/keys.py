@@ -6,7 +6,8 @@ from typing import Annotated
 import typer
 
 from service.commands.failures import WRONG_USE, failure
-from service.commands.opened import MOST_DAYS, ready_engine
+from service.commands.opened import ready_engine
+from service.commands.options import MOST_DAYS
 from service.principal import EVERYDAY, SCOPES
 
 app = typer.Typer(help="The API keys: who may use the service.", no_args_is_help=True)

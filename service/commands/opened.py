@@ -1,17 +1,12 @@
-"""The settings and the database that commands work with, and whose of its rows."""
+"""The settings and the database that commands work with."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Annotated
 
-import typer
 from sqlalchemy import Engine
 
 from service.commands.failures import WRONG_USE, plain_failures
 from service.config import Settings, StorageSettings, load_settings, load_storage_settings
-
-Owner = Annotated[str, typer.Option(help="Whose they are. [default: whoever uses the service without a key]")]
-MOST_DAYS = 36_500.0  # the calendar has an end
 
 
 def settings_with(**overrides: object) -> Settings:
