@@ -81,9 +81,9 @@ def in_turns(works: Mapping[K, Work], rounds: int, on_round: Callable[[], None] 
     return {name: Timing(tuple(seconds)) for name, seconds in spent.items()}
 
 
-def draw_picture(width_px: int, height_px: int) -> Picture:
-    """A picture uint8 [h, w, 3] with detail everywhere: a drawn texture, repeated."""
-    texture = draw_texture(np.random.default_rng(SEED), [], 512)
+def draw_picture(width_px: int, height_px: int, seed: int = SEED) -> Picture:
+    """A picture uint8 [h, w, 3] of a drawn texture, repeated; that of the first seed has detail everywhere."""
+    texture = draw_texture(np.random.default_rng(seed), [], 512)
     tile = (np.clip(texture, 0, 1) * 255).astype(np.uint8)
     repeats = (-(-height_px // 512), -(-width_px // 512), 1)
     return np.ascontiguousarray(np.tile(tile, repeats)[:height_px, :width_px])

@@ -83,8 +83,7 @@ def measure(model: Path, rounds: int, seconds: float, on_step: Callable[[], None
 def steps(rounds: int) -> int:
     """How often ``measure`` tells of progress."""
     graphs = len(THREADS) * (rounds + 1) + (len(THREADS) + 1) * (LARGE_ROUNDS + 1)
-    seams = 1 + len(bench_seams.BUDGETS)
-    return graphs + seams + 1 + len(bench_service.CLIENTS) + len(bench_service.PHOTOGRAPHS_K_CAM_PX)
+    return graphs + bench_seams.PICTURES + 1 + len(bench_service.CLIENTS) + len(bench_service.PHOTOGRAPHS_K_CAM_PX)
 
 
 def tables(report: SpeedReport) -> list[Table]:
@@ -137,7 +136,7 @@ def _sizes(report: SpeedReport) -> Table:
 def _seams(report: SpeedReport) -> Table:
     width, height = bench_seams.SIZE
     head = ("tiles", "at borders", "in overlaps", "elsewhere", "the same within 1 %", "largest difference")
-    table = Table(*head, title=f"Steps of ln z in tiles of {width}x{height}, over those of the picture read whole")
+    table = Table(*head, title=f"Steps of ln z in tiles of {width}x{height}, over those of pictures read whole")
     for row in report.seams:
         steps = (f"{times:.3f}" for times in (row.borders, row.overlaps, row.elsewhere))
         table.add_row(str(row.tiles), *steps, f"{row.alike:.1%}", f"{row.largest:.1%}")
