@@ -51,6 +51,11 @@ def plain(dice, name):
     return made, nodes, links, surface
 
 
+def lost(node):
+    """Whether a node is of a picture that its model came without, which Cycles shows as magenta."""
+    return node.type == "TEX_IMAGE" and not (node.image and all(node.image.size))
+
+
 def pictured(dice, name, size_m, tile_m, pictures, faint=False):
     """A picture laid on from all six sides in tiles of that size, tinted; ``faint``, it hardly shows under paint."""
     made, nodes, links, surface = plain(dice, name)
@@ -138,7 +143,10 @@ def furnish(dice, model, at, turn, pictures):
     thing.matrix_world = Matrix.Translation(at) @ Matrix.Rotation(turn, 4, "Z") @ grow @ foot @ thing.matrix_world
     if dice.random() < OWN_PAINT_SHARE:
         for slot in thing.material_slots:
-            for node in slot.material.node_tree.nodes if slot.material and slot.material.use_nodes else ():
+            nodes = slot.material.node_tree.nodes if slot.material and slot.material.use_nodes else ()
+            for node in [node for node in nodes if lost(node)]:
+                nodes.remove(node)
+            for node in nodes:
                 if node.type == "BSDF_PRINCIPLED":
                     matt(node, dice)
         return thing
