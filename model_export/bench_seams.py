@@ -19,7 +19,7 @@ from service.inference.tiles import layout
 
 SIZE = (2000, 1500)
 BUDGETS = (1_800_000, 900_000)  # pixels of a tile: two tiles, and six
-PICTURES = 6  # of one alone steps differ by 3 % at borders
+PICTURES = 6  # what tiles change is not alike in all
 K_CAM_PX = 3.0
 DEPTHS_M = (0.8, 4.0)  # of a wall that runs away to the right, focused at 2 m
 NEAR_BORDER_PX = 2  # what is read at half size is enlarged

@@ -144,10 +144,10 @@ def furnish(dice, model, at, turn, pictures):
     if dice.random() < OWN_PAINT_SHARE:
         for slot in thing.material_slots:
             nodes = slot.material.node_tree.nodes if slot.material and slot.material.use_nodes else ()
-            for node in [node for node in nodes if lost(node)]:
-                nodes.remove(node)
-            for node in nodes:
-                if node.type == "BSDF_PRINCIPLED":
+            for node in list(nodes):
+                if lost(node):
+                    nodes.remove(node)
+                elif node.type == "BSDF_PRINCIPLED":
                     matt(node, dice)
         return thing
     for slot in thing.material_slots:
