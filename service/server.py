@@ -10,7 +10,7 @@ import signal
 import socket
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from types import FrameType
 from typing import cast
 
@@ -269,16 +269,18 @@ class StoppingServer(uvicorn.Server):
 def bind(host: str, port: int) -> socket.socket:
     """A listening socket. Raises ``CannotListenError``, before anything slow was loaded."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # without the protocol's number asyncio leaves Nagle's delay on: 40 ms an answer
-    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-    try:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind((host, port))
-        listener.listen(BACKLOG)
-    except OSError as exc:
-        listener.close()
-        remedy = "--port or CAMIND_PORT" if exc.errno in PORTS_FAULTS else "--host or CAMIND_HOST"
-        raise CannotListenError(f"Cannot listen on {host}:{port} ({exc.strerror}): choose another {remedy}.") from exc
+    with ExitStack() as opened:
+        try:
+            # without the protocol's number asyncio leaves Nagle's delay on: 40 ms an answer
+            listener = opened.enter_context(socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP))
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.bind((host, port))
+            listener.listen(BACKLOG)
+        except OSError as exc:
+            remedy = "--port or CAMIND_PORT" if exc.errno in PORTS_FAULTS else "--host or CAMIND_HOST"
+            told = f"Cannot listen on {host}:{port} ({exc.strerror}): choose another {remedy}."
+            raise CannotListenError(told) from exc
+        opened.pop_all()
     return listener
 
 

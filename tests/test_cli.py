@@ -119,6 +119,12 @@ def test_an_address_that_is_not_this_machine_s_is_no_matter_of_the_port(host: st
         server.bind(host, 0)
 
 
+def test_a_kernel_without_ipv6_is_no_matter_of_the_port(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(socket, "AF_INET6", 99)  # a family that no kernel knows
+    with pytest.raises(OSError, match=r"Cannot listen on ::1:0 .* choose another --host"):
+        server.bind("::1", 0)
+
+
 def test_a_broken_model_is_said(tmp_path: Path) -> None:
     done = camind(tmp_path, "serve", "--port", "0", "--model", str(tmp_path))
     assert done.returncode == 1

@@ -122,9 +122,8 @@ def test_a_database_without_tables_is_not_ready(empty_engine: Engine) -> None:
 
 
 def test_an_unreachable_server_is_not_ready(tmp_path: Path) -> None:
-    pytest.importorskip("psycopg")
     engine = open_engine(f"postgresql+psycopg://nobody@/none?host={tmp_path}")
-    with pytest.raises(NotReady), reading(engine) as session:
+    with pytest.raises(NotReady, match="The database cannot be used"), reading(engine) as session:
         session.connection()
 
 
