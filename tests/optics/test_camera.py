@@ -25,6 +25,12 @@ def test_lens_specs_give_k_cam_at_the_images_width() -> None:
     assert D200.k_cam_px(2.0, 3872) == pytest.approx(D200.k_cam_px(2.0, 645) * 3872 / 645)
 
 
+def test_lens_specs_give_the_field_of_view() -> None:
+    assert D200.sensor_width_mm == pytest.approx(23.43, abs=0.01)
+    assert D200.fx_px(3872) == pytest.approx(35 / 23.43 * 3872, rel=1e-3)
+    assert D200.fx_px(645) == pytest.approx(35 / 23.43 * 645, rel=1e-3)
+
+
 @pytest.mark.parametrize("name", ["image_width_px", "image_height_px", "focus_distance_m", "k_cam_px"])
 @pytest.mark.parametrize("value", [0, -1, math.nan, math.inf])
 def test_out_of_bounds_is_refused_by_name(name: str, value: float) -> None:
