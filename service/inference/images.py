@@ -132,8 +132,8 @@ class StoredFrame:
 
 
 def photographs_in(folder: Path) -> list[Path]:
-    """The files of a folder that end as photographs do, by name."""
-    return sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)
+    """The files of a folder that end as photographs do, by name, but hidden ones: macOS puts a ``._`` beside each."""
+    return sorted(path for path in folder.glob("[!.]*") if path.suffix.lower() in SUFFIXES)
 
 
 def read_photograph(data: bytes, media_type: str | None = None, limits: ImageLimits | None = None) -> Photograph:

@@ -636,7 +636,7 @@ def test_a_bigtiff_is_told_what_to_become() -> None:
 
 
 def test_photographs_of_a_folder_are_known_by_how_cameras_name_them(tmp_path: Path) -> None:
-    for name in ("b.HIF", "a.JPG", "c.heic", "d.NEF", "e.txt", "f.mov", "g.jfif", "h.MPO"):
+    for name in ("b.HIF", "a.JPG", "c.heic", "d.NEF", "e.txt", "f.mov", "g.jfif", "h.MPO", "._a.JPG"):
         (tmp_path / name).touch()
     assert [path.name for path in photographs_in(tmp_path)] == ["a.JPG", "b.HIF", "c.heic", "d.NEF", "g.jfif", "h.MPO"]
 
