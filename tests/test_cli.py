@@ -441,6 +441,23 @@ def test_a_folder_of_photographs_becomes_depth(bench: Path, tiny_model_dir: Path
     assert (out / "whole.npy").stat().st_mtime_ns == kept
 
 
+def test_depth_has_its_name_once_it_is_on_the_disk(
+    bench: Path, tiny_model_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photo, out, on_disk = bench / "grey.png", bench / "depth", []
+    cv2.imwrite(str(photo), np.full((48, 64, 3), 128, np.uint8))
+
+    def synced(descriptor: int) -> None:
+        named = [file for file in out.iterdir() if not file.name.startswith(".")]
+        on_disk.append((len(named), os.fstat(descriptor).st_size))
+
+    monkeypatch.setattr(os, "fsync", synced)
+    asked = ("depth", str(photo), "--camera", "bench", "--out", str(out), "--model", str(tiny_model_dir))
+    done = at_once(*asked, "--format", "npy", "--format", "json")
+    assert done.exit_code == 0, done.stderr
+    assert on_disk == [(n, (out / f"grey.{kind}").stat().st_size) for n, kind in enumerate(("npy", "json"))]
+
+
 def test_a_table_tells_photographs_of_any_name_apart(bench: Path, tiny_model_dir: Path) -> None:
     photos = bench / "photos"
     photos.mkdir()

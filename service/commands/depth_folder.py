@@ -22,6 +22,7 @@ from service.inference.images import SUFFIXES, ImageLimits, photographs_in
 from service.memory import keep_freed_memory
 from service.metres import in_words
 from service.storage.cameras import CameraRecord
+from service.storage.disk import write_through
 from service.terminal import name_column, print_table, progress_bar, shown
 
 ENDINGS = {"preview": ".jpg"}  # of the others it is their name
@@ -147,10 +148,12 @@ def _made(photograph: Path, errand: Errand, estimator: Estimator, cancellation: 
 
 
 def _write(file: Path, body: bytes) -> None:
-    """All of it or nothing: the name is given to what is there."""
+    """All of it or nothing, after a power cut too: the name is given to what is on the disk."""
     part = file.with_name(f".{file.name}.part")
     try:
-        part.write_bytes(body)
+        with part.open("wb") as stream:
+            stream.write(body)
+            write_through(stream)
         part.replace(file)
     except OSError:
         part.unlink(missing_ok=True)
