@@ -3,10 +3,12 @@
 import json
 import os
 import re
+import signal
 import socket
 import sqlite3
 import subprocess
 import sys
+import time
 from contextlib import closing
 from datetime import timedelta
 from importlib.metadata import EntryPoint, version
@@ -439,6 +441,25 @@ def test_a_folder_of_photographs_becomes_depth(bench: Path, tiny_model_dir: Path
     assert "has depth of 1 of 1 photographs, and had that of 1" in again.stdout
     assert (out / "half [b].npy").exists()
     assert (out / "whole.npy").stat().st_mtime_ns == kept
+
+
+def test_photographs_that_had_depth_when_a_signal_came_are_told_of(bench: Path, tiny_model_dir: Path) -> None:
+    photos, out = bench / "photos", bench / "depth"
+    photos.mkdir()
+    for place in range(200):
+        cv2.imwrite(str(photos / f"{place}.png"), np.full((480, 640, 3), 128, np.uint8))
+    asked = ["depth", str(photos), "--camera", "bench", "--out", str(out), "--model", str(tiny_model_dir)]
+    with subprocess.Popen([CAMIND, *asked], stdout=subprocess.PIPE, text=True) as running:
+        while running.poll() is None and not list(out.glob("*.png")):
+            time.sleep(0.01)
+        running.terminate()
+        told, _ = running.communicate(timeout=30)
+    assert running.returncode == 128 + signal.SIGTERM
+    made = {file.stem for file in out.iterdir()}
+    assert 0 < len(made) < 200
+    named = {line.split(".png")[0] for line in told.splitlines() if ".png" in line}
+    assert named <= made
+    assert len(made - named) <= 2  # what was at work when it came
 
 
 def test_depth_has_its_name_once_it_is_on_the_disk(

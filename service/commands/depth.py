@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from service.commands.cameras import stored_camera
-from service.commands.failures import WRONG_USE, failure, plain_failures
+from service.commands.failures import WRONG_USE, end_in_order, failure, plain_failures
 from service.commands.opened import ready_engine, settings_with
 from service.commands.options import Owner
 from service.memory import lasting
@@ -41,6 +41,7 @@ def depth(
 
     Exit codes: 0; 1 where one of them has no depth, 2 for wrong options.
     """
+    end_in_order()
     settings, formats = settings_with(model_dir=model), formats or ["png"]
     with lasting():
         from service.commands.depth_folder import Errand, depth_folder, query_of
