@@ -183,7 +183,9 @@ def _printed(pose: GridPose, grid: CircleGrid, places_mm: Array, gamma_px: float
     low, high = points.min(0) - margin, points.max(0) + margin
     from_circle = _from_circle(grid, places_mm)
     pixel_mm = np.sqrt(np.abs(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]))
-    inked = _edge(from_circle / _along(from_circle, pixel_mm), gamma_px)
+    along = _along(from_circle, pixel_mm)
+    inwards = gamma_px**2 * along / grid.diameter_mm  # the middle of a round edge, by a Gaussian
+    inked = _edge(from_circle / along + inwards, gamma_px)
     paper = ((places_mm > low) & (places_mm < high)).all(-1)
     slope = (places_mm - points.mean(0)) @ np.array(pose.gradient) / (high - low).max()
     return np.asarray((np.where(paper, PAPER, TABLE) * (1 - inked) + INK * inked) * (1 + slope), np.float32)

@@ -25,6 +25,7 @@ from service.calibration.sharpening import sharpened
 from service.calibration.solve import FEW_VIEWS
 from service.calibration.target import CircleGrid
 from service.calibration.task import Picture, Task, Tell
+from service.calibration.tones import otherwise_toned
 from service.errors import CamindError
 from service.optics.camera import Intrinsics
 
@@ -138,17 +139,18 @@ def _result(task: Task, measured: list[Measured], at: Callable[[float], None]) -
             *otherwise_sized(usable),
             *placement.warnings,
             *constants.warnings,
-            *(_altered(found, constants) if task.method == "edge" else ()),
+            *(_altered(task.grid, found, constants) if task.method == "edge" else ()),
             *_uneven(corners),
             *apertures,
         ),
     )
 
 
-def _altered(found: _Fitted, constants: fit.Constants) -> tuple[str, ...]:
+def _altered(grid: CircleGrid, found: _Fitted, constants: fit.Constants) -> tuple[str, ...]:
     """What tells that blur is not that of one lens alone, locked."""
     edges = [edge for one in found.usable for edge in one.edges]
-    return (*sharpened(edges, found.spread), *refocused(found.circles, constants))
+    toned, ringed = otherwise_toned(grid, found.usable), sharpened(edges, found.spread)
+    return (*toned, *ringed, *refocused(found.circles, constants))
 
 
 def _fitted(task: Task, usable: list[Measured], size_px: tuple[int, int], at: Callable[[float], None]) -> _Fitted:

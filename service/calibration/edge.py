@@ -334,8 +334,9 @@ def _profiles(at: Array, radius: Array, blur_px: Array, spread: PointSpread) -> 
         return np.asarray(sum(parts))
     hard = _disc_profiles(at, radius, 2 * np.sqrt(blur_px**2 - rim**2))
     step = at[1] - at[0]
-    half = math.ceil(4 * rim / step)
-    kernel = np.exp(-0.5 * (np.arange(-half, half + 1) * step / rim) ** 2)
+    inwards = rim**2 / (2 * radius[0, 0])  # an edge's middle, by a Gaussian of a circle's edge
+    half = math.ceil((4 * rim + inwards) / step)
+    kernel = np.exp(-0.5 * ((np.arange(-half, half + 1) * step - inwards) / rim) ** 2)
     return np.asarray(correlate1d(hard, kernel / kernel.sum(), mode="nearest"))
 
 

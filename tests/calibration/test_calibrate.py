@@ -17,7 +17,12 @@ from service.calibration.task import Picture, Shot, Task
 from service.errors import InvalidImage
 from service.inference.cancellation import Cancelled
 from service.opencv import cv2
+from service.optics.light import decode_srgb
 from tests.simulated_sheets import CAMERA, DEPTHS_M, GRID, SheetPhoto, sheet_photos
+
+LEVELS = np.arange(256) / 255
+CONTRASTED = np.rint(255 * (LEVELS - 0.3 * np.sin(2 * np.pi * LEVELS) / (2 * np.pi))).astype(np.uint8)
+AS_LIGHT = np.rint(255 * decode_srgb(np.arange(256, dtype=np.float32) / np.float32(255))).astype(np.uint8)
 
 
 def pictures(taken: Sequence[SheetPhoto]) -> list[Picture]:
@@ -72,13 +77,13 @@ def test_the_plot_is_the_same_picture_every_time(report: Report) -> None:
 
 def test_pairs_as_in_the_paper_by_both_methods() -> None:
     """The slice of eq. 9 reads a third too much (its derivation: tests/calibration/test_edge.py)."""
-    focused = sheet_photos(CAMERA, (0.32, 0.34), "focused", seed=3)
-    both = pictures(focused + sheet_photos(CAMERA, (0.32, 0.34), seed=3))
+    depths_m = (0.32, 0.34, 0.36)
+    both = pictures(sheet_photos(CAMERA, depths_m, "focused", seed=3) + sheet_photos(CAMERA, depths_m, seed=3))
     edge = calibrate(Task(GRID, 0.5), both).result
     paper = calibrate(Task(GRID, 0.5, "paper"), both).result
     assert edge is not None
     assert paper is not None
-    assert edge.k_cam_px.value == pytest.approx(4.0, rel=0.05)
+    assert edge.k_cam_px.value == pytest.approx(4.0, rel=0.02)
     assert edge.focus_distance_m.low == edge.focus_distance_m.high == 0.5
     assert 1.25 < paper.k_cam_px.value / 4.0 < 1.6
 
@@ -156,6 +161,24 @@ def moved(shot: SheetPhoto) -> SheetPhoto:
     """The photograph as it would be if the camera had moved along while it was taken."""
     name, role, pixels = shot
     return name, role, np.asarray(cv2.blur(pixels, (9, 1)), np.uint8)
+
+
+def test_linear_light_is_told_though_its_circles_look_little_larger(few: list[SheetPhoto]) -> None:
+    """As an industrial camera writes it, without a profile: blur reads a seventh too small, by the same curve."""
+    linear: list[SheetPhoto] = [(name, role, AS_LIGHT[levels]) for name, role, levels in few]
+    found = calibrate(Task(GRID), pictures(linear)).result
+    assert found is not None
+    assert found.k_cam_px.value == pytest.approx(0.86 * 4.0, rel=0.04)
+    assert [words.startswith("circles look the larger the more") for words in found.warnings] == [True]
+    assert "linear light" in found.warnings[0]
+
+
+def test_a_tone_curve_is_told_by_circles_that_shrink_with_their_blur(taken: list[SheetPhoto]) -> None:
+    curved: list[SheetPhoto] = [(name, role, CONTRASTED[levels]) for name, role, levels in taken]
+    found = calibrate(Task(GRID), pictures(curved)).result
+    assert found is not None
+    assert found.k_cam_px.value == pytest.approx(0.94 * 4.0, rel=0.03)
+    assert ["smaller the more" in words and "tone curve" in words for words in found.warnings] == [True]
 
 
 def test_one_that_moved_and_one_that_was_there_before_are_left_out(taken: list[SheetPhoto]) -> None:
