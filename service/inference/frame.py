@@ -16,6 +16,7 @@ FocalLengthFrom = Literal["camera", "exif"]
 
 LENS_TOLERANCE = 0.05
 FOCUS_TOLERANCE = 0.15
+SAME_FOCUS, FROM_SENSOR = 1.01, 1.1  # told as it was noted, and so many times what it then is from the lens
 MOST_COARSE = 2.0  # times as far, or as near, as what was measured: what a camera notes is off by no more
 SENSOR_WIDTHS_MM = (0.5, 100.0)  # an endoscope's, and more than a digital back's
 VIEW_TOLERANCE = 1.05
@@ -93,6 +94,7 @@ def taken_otherwise(exif: Exif, camera: Camera, *, is_refocused: bool, is_found:
     yield from _other_lens(exif, camera)
     if not is_found:
         yield from _other_focus(exif, camera.focus_distance_m, is_refocused=is_refocused)
+        yield from _focus_from_sensor(exif, camera.focus_distance_m)
 
 
 def _other_lens(exif: Exif, camera: Camera) -> Iterator[str]:
@@ -167,6 +169,19 @@ def _other_focus(exif: Exif, focus_distance_m: float, *, is_refocused: bool) -> 
             else (f"the camera at {told}", "send this shot's focus_distance_m")
         )
         yield f"its EXIF says that it was focused at {noted}, {ours}: {advice}"
+
+
+def _focus_from_sensor(exif: Exif, focus_distance_m: float) -> Iterator[str]:
+    """A warning where what the camera noted was told as it is, close up, where that is much more than from the lens."""
+    noted_m, focal_length_m = exif.subject_distance_m, (exif.focal_length_mm or math.inf) / 1e3
+    if noted_m is None or not 1 / SAME_FOCUS <= focus_distance_m / noted_m <= SAME_FOCUS:
+        return
+    from_lens_m = exif.focus_from_lens_m or 2 * focal_length_m
+    if from_lens_m * FROM_SENSOR < noted_m:
+        yield (
+            f"focus_distance_m is {focus_in_words(focus_distance_m)}, as its EXIF notes, which most cameras count from "
+            f"the sensor: from the lens, as it is to be, that is about {focus_in_words(from_lens_m)}"
+        )
 
 
 def maybe_another_part(exif: Exif, camera: Camera) -> Iterator[str]:

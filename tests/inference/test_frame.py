@@ -240,6 +240,32 @@ def test_a_macro_lens_may_be_as_much_nearer_than_its_sensor_as_it_is_long(
     assert len([*taken_otherwise(macro, CAMERA.focused_at(from_lens_m), is_refocused=False)]) == is_other
 
 
+@pytest.mark.parametrize("is_refocused", [False, True])
+@pytest.mark.parametrize(
+    ("noted_m", "focal_length_mm", "told_m", "from_lens"),
+    [
+        (0.45, 50.0, 0.45, "0.3927 m"),
+        (0.45, 50.0, 0.393, None),
+        (0.7, 50.0, 0.7, None),  # 0.65 m from the lens
+        (2.0, 35.0, 2.0, None),
+        (0.31, 105.0, 0.31, "0.21 m"),  # of 1:1: a thin lens forms no image of what is so near to the sensor
+        (0.31, 105.0, 0.2, None),
+        (0.1, 6.81, 0.1, None),
+        (0.45, None, 0.45, None),
+        (math.inf, 50.0, 1e5, None),
+    ],
+)
+def test_a_focus_told_as_the_camera_noted_it_close_up_counts_from_the_sensor(
+    noted_m: float, focal_length_mm: float | None, told_m: float, from_lens: str | None, *, is_refocused: bool
+) -> None:
+    exif = Exif(focal_length_mm=focal_length_mm, subject_distance_m=noted_m)
+    said = [*taken_otherwise(exif, CAMERA.focused_at(told_m), is_refocused=is_refocused)]
+    assert [words.endswith(f"from the lens, as it is to be, that is about {from_lens}") for words in said] == (
+        [True] if from_lens else []
+    )
+    assert not [*taken_otherwise(exif, CAMERA.focused_at(told_m), is_refocused=is_refocused, is_found=True)]
+
+
 @pytest.mark.parametrize(
     ("focus_distance_m", "focal_length_m", "known_at_m", "words"),
     [
