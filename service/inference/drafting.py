@@ -223,6 +223,11 @@ def _sensor_widths_mm(
         )
         if exif.focal_length_35mm == exif.focal_length_mm and not math.isclose(longer, 3 / 2, rel_tol=ASPECT_TOLERANCE):
             words += "; focal length and equivalent are the same: a phone's real focal length is a few millimetres"
+        if exif.is_zoomed:
+            words += (
+                f"; it is taken to count the digital zoom of {exif.zoom:g}: where it is that of the whole sensor, "
+                "lens.pixel_pitch_um is to be divided by the zoom"
+            )
         crops.append((exif.focal_length_35mm / exif.focal_length_mm / exif.zoom, words))
     for crop, words in crops:
         width_mm = FULL_FRAME_DIAGONAL_MM / (crop or math.inf) * aspect / math.hypot(aspect, 1)

@@ -229,6 +229,9 @@ def test_a_digital_zoom_is_taken_out_of_the_equivalent_and_told() -> None:
     zoomed = draft(make="Nobody", model="Nothing 1", focal_length_35mm=104.0, digital_zoom=2.0)
     assert zoomed.lens.pixel_pitch_um == pytest.approx(6.05 / 2, rel=0.05)
     assert said(zoomed, "digital zoom")
+    assert said(zoomed, "taken to count the digital zoom of 2", "lens.pixel_pitch_um is to be divided by the zoom")
+    assert not said(draft(digital_zoom=2.0, focal_plane_pitch_um=6.05), "taken to count")
+    assert not said(draft(make="Nobody", model="Nothing 1"), "taken to count")
 
 
 @pytest.mark.parametrize("tags", [{}, {"focal_plane_pitch_um": 6.05}, {"focal_plane_pitch_um": 6.05, "width_px": None}])
