@@ -6,6 +6,7 @@ from service.optics.camera import FOCUS_DISTANCES_M
 
 CLOSE_M = 0.5
 CLOSE_DIGITS = 4
+MOST_IN_DIGITS_M = 1000.0
 
 
 def in_words(depth_m: float, like_m: float | None = None) -> str:
@@ -16,5 +17,7 @@ def in_words(depth_m: float, like_m: float | None = None) -> str:
 
 
 def focus_in_words(focus_distance_m: float) -> str:
-    """To four digits, with its unit; what stands for infinity by that name."""
-    return "infinity" if focus_distance_m >= FOCUS_DISTANCES_M[1] else f"{focus_distance_m:.4g} m"
+    """To four digits, or whole metres, with its unit; what stands for infinity by that name."""
+    if focus_distance_m >= FOCUS_DISTANCES_M[1]:
+        return "infinity"
+    return f"{focus_distance_m:.0f} m" if focus_distance_m >= MOST_IN_DIGITS_M else f"{focus_distance_m:.4g} m"

@@ -13,7 +13,7 @@ from functools import lru_cache
 import lensfunpy
 
 from service.inference.exif import FULL_FRAME_DIAGONAL_MM, Exif
-from service.optics.camera import FOCUS_DISTANCES_M, Lens
+from service.optics.camera import AS_INFINITY_M, FOCUS_DISTANCES_M, Lens
 
 SENSOR_WIDTHS_MM = (1.0, 70.0)
 # of the long side to the short one; others are cut out of one of these
@@ -85,13 +85,14 @@ def draft_camera(exif: Exif, width_px: int, height_px: int) -> Draft:
 
 def _focus_m(exif: Exif, warnings: list[str]) -> float | None:
     distance_m, farthest_m = exif.subject_distance_m, FOCUS_DISTANCES_M[1]
-    if distance_m == math.inf:
+    if distance_m is not None and distance_m >= AS_INFINITY_M:
+        at = "infinity" if distance_m == math.inf else f"{distance_m:.10g} m, which is all but infinity,"
         warnings.append(
-            f"focused at infinity as the camera reports it, for which {farthest_m:g} m stand: better measure from the "
+            f"focused at {at} as the camera reports it, for which {farthest_m:g} m stand: better measure from the "
             "lens to what is sharpest"
         )
         return farthest_m
-    if distance_m is None or not FOCUS_DISTANCES_M[0] <= distance_m <= farthest_m:
+    if distance_m is None or distance_m < FOCUS_DISTANCES_M[0]:
         warnings.append("its EXIF does not say where the lens was focused: focus_distance_m is needed")
         return None
     warnings.append(

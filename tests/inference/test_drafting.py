@@ -285,7 +285,12 @@ def test_where_it_was_focused_is_taken_with_care() -> None:
     drafted = draft(subject_distance_m=1.5)
     assert drafted.focus_distance_m == 1.5
     assert said(drafted, "1.5 m", "coarse")
-    assert draft(subject_distance_m=1e9).focus_distance_m is None
+    assert draft(subject_distance_m=1e-4).focus_distance_m is None
+    for far_m, words in ((65.535, "65.535 m, which is all but infinity"), (65535.0, "65535 m"), (1e9, "1000000000 m")):
+        far = draft(subject_distance_m=far_m)
+        assert far.focus_distance_m == 100_000
+        assert said(far, words, "100000 m stand")
+    assert draft(subject_distance_m=49.0).focus_distance_m == 49.0
     infinite = draft(subject_distance_m=math.inf)
     assert infinite.focus_distance_m == 100_000
     assert said(infinite, "focused at infinity", "100000 m stand")

@@ -195,6 +195,7 @@ def test_a_portrait_mode_is_told_of() -> None:
         (None, 35.0, False),
         (0.6, 100.0, True),
         (2.35, 100.0, False),  # 2.24 m from the lens
+        (65535.0, 35.0, True),
         (math.inf, 35.0, True),
         (math.inf, None, True),
     ],
@@ -205,7 +206,7 @@ def test_another_focus_than_the_camera_s_is_told_of_unless_it_came_with_the_phot
     exif = Exif(focal_length_mm=focal_length_mm, subject_distance_m=noted_m)
     said = [*taken_otherwise(exif, CAMERA, is_refocused=False)]
     assert len(said) == is_other
-    noted = "infinity" if noted_m == math.inf else f"{noted_m} m"
+    noted = "infinity" if noted_m == math.inf else f"{noted_m:.5g} m" if noted_m else ""
     assert all(f"focused at {noted}, the camera at 2 m" in words for words in said)
     assert not [*taken_otherwise(exif, CAMERA, is_refocused=False, is_found=True)]
 
