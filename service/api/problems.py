@@ -113,7 +113,9 @@ EXAMPLES = {
     "invalid-request": "lens.focal_length_mm: Input should be greater than or equal to 0.1",
     "invalid-image": "The jpeg file is cut off: it ends before the picture does.",
     "image-size-mismatch": (
-        "The photograph has 640x480 pixels upright, the camera 645x432: send the whole frame, not a crop."
+        "The photograph has 640x480 pixels upright, the camera 645x432: send the whole frame, not a crop; a region "
+        "that the sensor reads out is a camera of its own, of that size, with k_cam_px as it is (by lens specs, "
+        "sensor_width_px is the region's)."
     ),
     "idempotency-key-reused": (
         "This Idempotency-Key came with another request before: send a new key with a new request."

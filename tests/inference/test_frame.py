@@ -81,6 +81,8 @@ def test_a_resized_frame_scales_the_blur_constants_and_says_so(orientation: int)
     assert camera.gamma_px**2 > thin_lens.PIXEL_BOX_VARIANCE > 0.25**2
     assert "k_cam_px 3" in warnings[0]
     assert f"gamma_px {camera.gamma_px:.4g}" in warnings[0]
+    assert "a region that the sensor reads out is a camera of its own" in warnings[0]
+    assert "; " not in warnings[0]  # which stands between warnings in the header
 
 
 def test_a_frame_made_larger_scales_gamma_alike() -> None:
@@ -290,7 +292,12 @@ def test_a_focal_length_that_focus_elsewhere_changes_is_told_of(
 
 @pytest.mark.parametrize(
     ("width", "height", "advice"),
-    [(640, 400, "not a crop"), (480, 640, "the original"), (240, 320, "the original"), (641, 300, "not a crop")],
+    [
+        (640, 400, "not a crop.*region that the sensor reads out"),
+        (480, 640, "the original"),
+        (240, 320, "the original"),
+        (641, 300, "not a crop"),
+    ],
 )
 def test_another_frame_is_refused_with_both_sizes(width: int, height: int, advice: str) -> None:
     with pytest.raises(ImageSizeMismatch, match=rf"{width}x{height}.*640x480.*{advice}"):
