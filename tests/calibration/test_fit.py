@@ -84,6 +84,26 @@ def test_the_intervals_hold() -> None:
     assert held >= 17
 
 
+def test_no_interval_is_narrower_than_what_all_pictures_share() -> None:
+    """0.3 % of blur, 0.5 % for every doubling of it, 0.005 px of gamma, 0.05 % of the focus distance."""
+    many = circles(tuple(np.geomspace(0.6, 2.4, 24).tolist()), error=0.0, per_picture=4)
+    found = fit_constants(many, resamples=100)
+    assert 0.02 < found.k_cam_px.relative_width < 0.026
+    assert 0.002 < found.focus_distance_m.relative_width < 0.003
+    pairs = replace(many, is_focused=many.picture % 2 == 0)
+    blur = np.asarray(thin_lens.blur_from_defocus(K_CAM * pairs.excess(FOCUS), 0.2))
+    gamma = fit_constants(replace(pairs, blur_px=blur), resamples=100).gamma_px
+    assert 2 * 0.008 < gamma.high - gamma.low < 2 * 0.011
+
+
+def test_what_few_pictures_cannot_show_is_in_their_intervals() -> None:
+    """That each has an error of its own of 0.5 %, exact as they may be."""
+    found = fit_constants(circles(BOTH_SIDES, error=0.0, per_picture=4), resamples=100)
+    assert 0.003 < found.focus_distance_m.relative_width < 0.004
+    of_two = fit_constants(circles((0.6, 1.8), error=0.0), resamples=100)
+    assert of_two.k_cam_px.relative_width > 0.06, "and in how blur changes over its depths"
+
+
 def test_a_few_wrong_circles_are_shown_and_move_little() -> None:
     some = circles(BOTH_SIDES)
     blur = some.blur_px.copy()

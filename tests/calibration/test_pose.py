@@ -173,6 +173,10 @@ def test_the_less_the_sheet_is_tilted_the_larger_is_the_error_stated(tilted: flo
     assert found.focal_error * tilted**2 == pytest.approx(2.6e-4, rel=0.2), "as the square of the tilt"
 
 
+def test_a_focal_length_that_is_uncertain_by_nearly_a_tenth_is_told() -> None:
+    assert 0.07 < place(FEWER, views(flat(FEWER), tilted=0.065)[0], SIZE).focal_error < 0.1
+
+
 @pytest.mark.parametrize("tilted", [0.0, 0.05])
 def test_sheets_that_were_hardly_tilted_tell_no_focal_length(tilted: float) -> None:
     seen, _ = views(flat(FEWER), tilted=tilted)
@@ -235,8 +239,8 @@ def test_a_sheet_stands_where_it_was_placed(found: Placement) -> None:
         assert stand(GRID, view, found.intrinsics) == pytest.approx(expected, rel=0.02)
 
 
-@pytest.mark.parametrize("size", [0.001, 0.02])
+@pytest.mark.parametrize("size", [0.001, 0.012, 0.02])
 def test_a_sheet_told_in_metres_is_noticed(size: float) -> None:
     grid = CircleGrid(GRID.kind, GRID.rows, GRID.columns, size * GRID.spacing_mm, size * GRID.diameter_mm)
     said = [warning for warning in place(grid, views(flat())[0], SIZE).warnings if "in millimetres" in warning]
-    assert ["0.75 mm from the lens" in warning for warning in said] == [True] * (size == 0.001)
+    assert [f"{750 * size:.2g} mm from the lens" in warning for warning in said] == [True] * (size < 0.0133)
