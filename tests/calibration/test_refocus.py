@@ -17,14 +17,26 @@ FOLLOWED = (FOCUS * (DEPTHS_M / FOCUS) ** 0.3).tolist()
 DRIFTED = [FOCUS * part for part in (0.9, 0.95, 1.0, 1.05, 1.1)]
 
 
-def circles(focus_m: Sequence[float], *, opened: Sequence[float] = (1, 1, 1, 1, 1), seed: int = 0) -> Circles:
-    """Photographs of a tilted sheet at each depth, each with its focus and aperture; errors as simulated lenses'."""
+def circles(
+    focus_m: Sequence[float],
+    *,
+    opened: Sequence[float] = (1, 1, 1, 1, 1),
+    seed: int = 0,
+    k_cam_px: float = K_CAM,
+    errors: tuple[float, float, float] = (0.005, 0.0, 0.01),
+) -> Circles:
+    """Photographs of a tilted sheet at each depth, each with its focus and aperture; errors as simulated lenses'.
+
+    ``errors`` are those of a photograph's blur, of how it changes over its depths, and of a circle's.
+    """
     rng = np.random.default_rng(seed)
     picture = np.repeat(np.arange(DEPTHS_M.size), 40)
-    focus, k_cam = np.asarray(focus_m)[picture], K_CAM * np.asarray(opened)[picture]
-    depth = DEPTHS_M[picture] * (1 + rng.uniform(-0.05, 0.05, picture.size))
+    focus, k_cam = np.asarray(focus_m)[picture], k_cam_px * np.asarray(opened)[picture]
+    along = rng.uniform(-0.05, 0.05, picture.size)
+    depth = DEPTHS_M[picture] * (1 + along)
     blur = thin_lens.blur_at_depth(depth, focus, k_cam * FOCUS / focus, GAMMA)
-    error = 0.005 * rng.standard_normal(DEPTHS_M.size)[picture] + 0.01 * rng.standard_normal(picture.size)
+    error = errors[0] * rng.standard_normal(DEPTHS_M.size)[picture] + errors[2] * rng.standard_normal(picture.size)
+    error += errors[1] * rng.standard_normal(DEPTHS_M.size)[picture] * along / along.std()
     nowhere = np.zeros(picture.size, np.bool_)
     return Circles(depth, blur * np.exp(error), np.full(picture.size, 0.02), picture, nowhere)
 
@@ -41,6 +53,12 @@ def test_of_one_focus_nothing_is_said(seed: int) -> None:
     k_cam, words = said(circles([FOCUS] * 5, seed=seed))
     assert k_cam == pytest.approx(K_CAM, rel=0.02)
     assert not words
+
+
+@pytest.mark.parametrize("seed", [1, 9, 19])
+def test_what_photographs_are_off_by_each_in_its_own_way_is_no_focus_that_moved(seed: int) -> None:
+    """Circles of one are off together; a small k_cam tells focus so little that it would take on any of that."""
+    assert not said(circles([FOCUS] * 5, seed=seed, k_cam_px=1.5, errors=(0.005, 0.0015, 0.003)))[1]
 
 
 @pytest.mark.parametrize(
