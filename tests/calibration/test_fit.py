@@ -1,12 +1,15 @@
 """The joint fit, on circles whose camera is known."""
 
 import re
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from service.calibration.fit import Circles, FitError, fit_as_paper, fit_constants, odd_pictures, per_circle_k_cam
+from service.calibration.fit import _check_span as check_span
+from service.calibration.report import Interval
 from service.optics import thin_lens
 
 K_CAM, GAMMA, FOCUS = 6.0, 0.7, 1.2
@@ -299,6 +302,12 @@ def test_pictures_that_were_each_focused_elsewhere_are_to_be_taken_with_the_focu
     moved = replace(locked, depth_m=locked.depth_m * elsewhere)
     said = [" ".join(fit_constants(each, given, resamples=40).warnings) for each in (locked, moved)]
     assert ["lock the focus" in words for words in said] == [False, True]
+
+
+@pytest.mark.parametrize(("times", "is_told"), [(9.5, True), (10.5, False)])
+def test_a_k_cam_whose_interval_spans_ten_times_is_none(times: float, *, is_told: bool) -> None:
+    with nullcontext() if is_told else pytest.raises(FitError, match=f"anything from 2 to {2 * times:.2g} by these"):
+        check_span(Interval(5.0, 2.0, 2.0 * times))
 
 
 def test_a_k_cam_that_may_be_anything_is_none() -> None:

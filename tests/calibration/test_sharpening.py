@@ -43,3 +43,19 @@ def edges(develop: Callable[[Levels], Levels], *blur_px: float) -> list[EdgeFit]
 def test_sharpening_is_told_by_its_ring(develop: Callable[[Levels], Levels]) -> None:
     sharp, blurred = edges(develop, 0.7, 0.9), edges(develop, 1.5)
     assert len(sharpened(9 * blurred + 12 * sharp, SPREAD)) == (develop is with_sharpening)
+
+
+@pytest.mark.parametrize(("part", "is_told"), [(0.2, False), (0.4, True)])
+def test_a_ring_of_a_hundredth_of_the_contrast_is_told(part: float, *, is_told: bool) -> None:
+    """A sharpening of 0.2 leaves 0.006 about a sharp circle, one of 0.4 leaves 0.015."""
+
+    def develop(levels: Levels) -> Levels:
+        return as_it_fell(levels) + np.float32(part / 0.6) * (with_sharpening(levels) - levels)
+
+    assert len(sharpened(24 * edges(develop, 0.7), SPREAD)) == is_told
+
+
+@pytest.mark.parametrize(("ringed", "is_told"), [(17, False), (19, True)])
+def test_three_quarters_of_the_sharpest_circles_tell_sharpening(ringed: int, *, is_told: bool) -> None:
+    (with_ring,), (without,) = edges(with_sharpening, 0.9), edges(as_it_fell, 0.7)
+    assert len(sharpened([*ringed * [with_ring], *(24 - ringed) * [without]], SPREAD)) == is_told

@@ -274,11 +274,14 @@ def test_a_focus_told_as_the_camera_noted_it_close_up_counts_from_the_sensor(
     [
         (0.2, 0.05, None, "1.33 times"),
         (0.06, 0.025, None, "1.71 times"),
-        (2.0, 0.05, None, ""),
+        (0.8, 0.05, None, "1.07 times"),
+        (1.2, 0.05, None, ""),
         (0.2, None, None, ""),
         (0.2, 0.05, 0.2, ""),
         (0.2, 0.05, 2.0, "at 2 m: in one that moves as a whole it is 1.3 times that, and points lie as much near"),
         (2.0, 0.05, 0.2, "at 0.2 m: in one that moves as a whole it is 0.769 times that, and points lie as much far"),
+        (2.0, 0.05, 0.6, "0.94 times"),
+        (2.0, 0.05, 0.8, ""),
     ],
 )
 def test_a_focal_length_that_focus_elsewhere_changes_is_told_of(
@@ -363,11 +366,12 @@ def test_intrinsics_of_another_size_are_told_by_where_their_axis_is(ratio: float
     assert not [*maybe_of_another_size(replace(CAMERA, intrinsics=None))]
 
 
-@pytest.mark.parametrize("off_px", [(200, 0), (-200, 0), (0, 150), (0, -150)])
-def test_an_axis_off_the_middle_one_way_is_told(off_px: tuple[int, int]) -> None:
+@pytest.mark.parametrize("off_px", [(170, 0), (-170, 0), (0, 130), (0, -130)])
+def test_an_axis_an_eighth_off_the_middle_one_way_is_told(off_px: tuple[int, int]) -> None:
     camera = Camera(1280, 960, 2.0, 3.8, intrinsics=Intrinsics.centred(900.0, 1280, 960))
-    assert not [*maybe_of_another_size(camera)]
-    assert [*maybe_of_another_size(camera.cropped(*off_px, 1280, 960))]
+    for part, is_told in ((0.85, False), (1.0, True)):
+        cropped = camera.cropped(*(round(part * px) for px in off_px), 1280, 960)
+        assert len([*maybe_of_another_size(cropped)]) == is_told
 
 
 @pytest.mark.parametrize(

@@ -123,6 +123,20 @@ def test_the_intervals_hold_and_tell_something() -> None:
     assert sum(widths) / 60 < 1.35
 
 
+def test_where_a_reading_tells_nothing_the_interval_is_that_of_what_was_told() -> None:
+    """A tenth, 95 times in a hundred: 1.96 of it by a normal law, a little more by one of longer tails."""
+    fit = fit_focus(CAMERA, [Sighting(1.0, 1.0, 1e6)])
+    assert fit.focus_distance_m == pytest.approx(2.0, rel=0.02)
+    for end_m in (fit.low_m, fit.high_m):
+        assert 0.196 < abs(math.log(end_m / 2.0)) < 0.25
+
+
+@pytest.mark.parametrize(("true_m", "end_m"), [(7.0, 5.0), (0.65, 0.8)])
+def test_what_was_told_is_off_by_two_and_a_half_times_at_most(true_m: float, end_m: float) -> None:
+    fit = fitted(true_m, *DEPTHS_M)
+    assert (fit.high_m if true_m > end_m else fit.low_m) == pytest.approx(end_m, rel=0.01)
+
+
 @pytest.mark.parametrize("mistaken_m", [1.6, 0.4])
 def test_one_thing_mistaken_does_not_decide_and_is_told_apart(mistaken_m: float) -> None:
     true = CAMERA.focused_at(1.8)
@@ -165,6 +179,17 @@ def test_of_a_lens_said_to_be_at_infinity_one_thing_tells_where_it_is_and_one_re
     told = Camera(640, 480, 100_000.0, 7.6e-5, 0.5)
     assert fitted(3.0, 0.8, told=told).focus_distance_m == pytest.approx(3.0, rel=0.2)
     assert fitted(3.0, 0.8, told=told, error=0.8).focus_distance_m > 10
+
+
+def test_a_lens_said_to_be_at_infinity_is_taken_half_way_by_a_reading_as_doubtful_as_that() -> None:
+    """0.3 dioptres are as much as 0.3 of such a blur."""
+    fit = fitted(2.5, 0.8, told=Camera(640, 480, 100_000.0, 7.6e-5, 0.5), error=0.3)
+    assert 1 / fit.focus_distance_m == pytest.approx(0.4 / 2, abs=0.03)
+
+
+def test_a_lens_said_to_be_at_infinity_is_at_one_metre_and_a_half_or_beyond() -> None:
+    fit = fitted(1.2, 0.5, 0.8, 1.2, told=Camera(640, 480, 100_000.0, 7.6e-5, 0.5))
+    assert fit.low_m == pytest.approx(1.5, rel=0.01)
 
 
 def test_a_lens_at_infinity_is_left_there() -> None:
