@@ -9,19 +9,28 @@ from numpy.typing import NDArray
 
 from model_export.render import DISC, GAUSSIAN, PointSpread, blur
 from service.calibration.edge import EdgeError, find_spread, fit_again, fit_edge, slice_blur
+from service.opencv import cv2
 
 SIZE = 128
 FINE = 8
 
 
 def circle(
-    radius: float = 24.0, x: float = 63.3, y: float = 64.8, *, axes_ratio: float = 1.0, turn: float = 0.0
+    radius: float = 24.0,
+    x: float = 63.3,
+    y: float = 64.8,
+    *,
+    axes_ratio: float = 1.0,
+    turn: float = 0.0,
+    soft_px: float = 0.0,
 ) -> NDArray[np.float32]:
-    """White paper [h,w] with a black ellipse, each pixel the mean over its square."""
+    """White paper [h,w] with a black ellipse, by a Gaussian lens, each pixel the mean over its square."""
     at = (np.arange(SIZE * FINE) + 0.5) / FINE - 0.5
     u, v = at[None, :] - x, at[:, None] - y
     along, across = u * math.cos(turn) + v * math.sin(turn), v * math.cos(turn) - u * math.sin(turn)
     fine = 0.9 - 0.85 * ((along / radius) ** 2 + (across / (radius * axes_ratio)) ** 2 < 1)
+    if soft_px:
+        fine = cv2.GaussianBlur(fine, (0, 0), soft_px * FINE)
     return np.asarray(fine.reshape(SIZE, FINE, SIZE, FINE).mean((1, 3)), np.float32)
 
 
@@ -51,6 +60,12 @@ def test_small_blur_is_found_under_a_gaussian_and_a_little_high_under_a_disc(sig
     assert fit_edge(photographed(circle(), sigma, GAUSSIAN), 64, 64, 23).blur_px == pytest.approx(total, rel=0.015)
     disc = fit_edge(photographed(circle(), sigma, DISC), 64, 64, 23)
     assert disc.blur_px == pytest.approx(total, rel=0.08)
+
+
+@pytest.mark.parametrize("sigma", [0.3, 0.5, 0.9])
+def test_a_blur_as_small_as_a_pixel_is_read_beside_the_pixel_s_own_box(sigma: float) -> None:
+    found = fit_edge(circle(soft_px=sigma), 64, 64, 23)
+    assert found.blur_px == pytest.approx(math.sqrt(sigma**2 + 1 / 12), rel=0.009)
 
 
 def test_noise_shows_in_the_error_that_is_stated() -> None:

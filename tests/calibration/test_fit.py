@@ -127,6 +127,15 @@ def test_a_picture_that_is_odd_is_told_from_pictures_with_some_wrong_circles() -
     assert odd_pictures(some, fit_constants(some, resamples=0)) == []
 
 
+@pytest.mark.parametrize(("times", "odd"), [(1.08, []), (1.15, [1])])
+def test_a_picture_is_odd_that_is_blurred_by_more_than_a_tenth_otherwise(times: float, odd: list[int]) -> None:
+    some = circles(BOTH_SIDES, error=0.002)
+    wrong = replace(some, blur_px=np.where(some.picture == 1, times * some.blur_px, some.blur_px))
+    found = fit_constants(wrong, resamples=0)
+    assert found.is_outlier[some.picture == 1].all()
+    assert odd_pictures(wrong, found) == odd
+
+
 def test_one_side_is_said_and_stated_wide() -> None:
     near = (0.5, 0.55, 0.6, 0.65, 0.7)
     free = fit_constants(circles(near), resamples=40)
@@ -211,11 +220,12 @@ def test_two_lenses_mixed_are_said() -> None:
     assert any("no one curve fits" in warning for warning in fit_constants(mixed, resamples=10).warnings)
 
 
-def test_too_few_circles_are_an_error_and_one_picture_a_warning() -> None:
+def test_too_few_circles_are_an_error_and_fewer_than_three_pictures_a_warning() -> None:
     with pytest.raises(FitError, match="3 defocused circles"):
         fit_constants(circles((0.6,), per_picture=3))
-    one = fit_constants(circles((0.6,)), FOCUS, resamples=20)
-    assert any("fewer than three" in warning for warning in one.warnings)
+    for depths_m, is_told in (((0.6,), True), ((0.6, 1.8), True), ((0.6, 0.9, 1.8), False)):
+        found = fit_constants(circles(depths_m, error=0.005), FOCUS, resamples=20)
+        assert any("fewer than three" in warning for warning in found.warnings) == is_told
 
 
 def test_pictures_in_focus_show_gamma_alone() -> None:
@@ -302,6 +312,7 @@ def test_pictures_that_were_each_focused_elsewhere_are_to_be_taken_with_the_focu
     moved = replace(locked, depth_m=locked.depth_m * elsewhere)
     said = [" ".join(fit_constants(each, given, resamples=40).warnings) for each in (locked, moved)]
     assert ["lock the focus" in words for words in said] == [False, True]
+    assert not any("on one side" in words for words in said)
 
 
 @pytest.mark.parametrize(("times", "is_told"), [(9.5, True), (10.5, False)])

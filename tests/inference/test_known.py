@@ -190,7 +190,12 @@ def test_a_known_side_holds_where_the_model_is_sure_of_the_other(estimator: Esti
 
 
 @pytest.mark.parametrize(
-    ("red", "told"), [(1, "60,120 looks surely beyond"), (254, "330,40 looks surely nearer than"), (EVENLY, "")]
+    ("red", "told"),
+    [
+        *((red, "60,120 looks surely beyond") for red in (1, 10)),
+        *((red, "330,40 looks surely nearer than") for red in (245, 254)),
+        *((red, "") for red in (16, EVENLY, 239)),  # 0.95 is 242
+    ],
 )
 def test_a_known_depth_on_the_side_where_the_photograph_surely_is_not_is_told_of(
     estimator: Estimator, red: int, told: str
@@ -205,6 +210,15 @@ def test_two_depths_of_one_pixel_are_an_error_of_that_much_and_told_of(estimator
     assert 0.6 * LEFT_M < answer.depth_m[120, 60] < LEFT_M
     assert answer.sigma_m[120, 60] / answer.depth_m[120, 60] > 0.2
     assert sum("for the known depth" in warning for warning in answer.warnings) == len(known)
+
+
+@pytest.mark.parametrize(("times", "is_told"), [(0.84, False), (0.79, True)])
+def test_an_answer_a_tenth_off_what_is_known_is_told_of(estimator: Estimator, times: float, *, is_told: bool) -> None:
+    """Half way between two depths of one pixel."""
+    known = [*KNOWN, KnownDepth(60, 120, times * LEFT_M)]
+    warnings = estimator.estimate(photograph(), TOLD, "near", known=known).warnings
+    told = [warning for warning in warnings if "at 60,120 for the known depth" in warning]
+    assert len(told) == 2 * is_told
 
 
 @pytest.mark.parametrize(("side", "pixel", "depth_m"), [("near", (330, 40), RIGHT_M), ("far", (60, 120), LEFT_M)])
