@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from service.inference.artifact import Interval, load_model_folder
 from service.inference.cancellation import Cancellation, Cancelled
-from service.inference.depth_map import LEAST_BLUR_ERROR_PX, Reading, decide, layers_at
+from service.inference.depth_map import LEAST_BLUR_ERROR_PX, NO_ANSWER, Reading, decide, layers_at
 from service.inference.estimator import SURROUNDINGS_PX, Estimator
 from service.inference.hypotheses import in_metres
 from service.inference.known import KnownDepth
 from service.inference.pair import MAPS, GraphPair, RawMaps, Side
 from service.inference.part import Part
-from service.inference.resampling import Lines
+from service.inference.resampling import Lines, Ratio
 from service.inference.session import Graph
 from service.optics import thin_lens
 from service.optics.camera import Camera, Intrinsics
@@ -94,6 +94,20 @@ def test_beyond_a_far_focus_depth_ends_where_blur_is_that_of_infinity(estimator:
     near = estimator.estimate(grey(beyond), camera, "near")
     assert near.valid.all()
     assert np.isnan(near.depth_alt_m).all()
+
+
+def test_at_a_farther_focus_what_had_no_answer_has_none_and_none_is_beyond_the_farthest() -> None:
+    read_m = np.array([[1.0, 1.0, 1.9, 1.99, 2.5]], np.float32)
+    error = np.array([[0.1, NO_ANSWER, 0.01, 0.01, 0.01]], np.float32)
+    far_m = np.full_like(read_m, 1.9)
+    reading = Reading(read_m, far_m, np.ones_like(read_m), error, np.ones_like(read_m), CAMERA, 1.0, Ratio(1, 1))
+    moved = reading.at_focus(100_000.0, 100.0)
+    np.testing.assert_array_equal(moved.error <= 1, [[True, False, True, False, False]])
+    np.testing.assert_allclose(moved.depth_m[0, [0, 2]], 1 / (1 / read_m[0, [0, 2]] - 0.5 + 1e-5), rtol=1e-4)
+    np.testing.assert_allclose(moved.error[0, [0, 2]], [0.2, 0.2], rtol=1e-2)
+    assert moved.depth_m.max() == 100.0
+    np.testing.assert_allclose(moved.other_m, 38.0, rtol=1e-2)
+    assert np.isnan(reading.at_focus(100_000.0, 30.0).other_m).all()
 
 
 def test_what_is_in_focus_is_on_neither_side(estimator: Estimator) -> None:
