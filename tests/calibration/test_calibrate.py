@@ -206,7 +206,7 @@ def test_what_most_photographs_are_exposed_like_is_said_once_more_of_all() -> No
             PictureReport("", "defocused", found=True),
             paper_levels=[*[180.0] * 7, level, level] if level > 180 else [level] * 9,
         )
-        for level in (40.0, 180.0, 254.0)
+        for level in (79.0, 81.0, 254.0)
     )
     assert ill_exposed([dark, good, dark])[0].startswith("2 of 3 photographs are underexposed")
     assert ill_exposed([good, bright, bright])[0].startswith("2 of 3 photographs are overexposed")
@@ -219,9 +219,10 @@ def test_an_aperture_is_told_where_all_defocused_photographs_have_one() -> None:
 
     assert aperture_of([at(2.8), at(None), at(2.8), at(2.83), at(8.0, "focused")]) == (2.8, ())
     assert aperture_of([at(None), at(0.0), at(1e9), at(8.0, "focused")]) == aperture_of([]) == (None, ())
-    found, (warning,) = aperture_of([at(2.8), at(2.8), at(3.2)])
-    assert found is None
-    assert warning.startswith("their EXIF says f/2.8 to f/3.2,")
+    for opened in ((2.8, 4.0), (5.6, 6.3)):  # a stop, a third of one
+        found, (warning,) = aperture_of([at(opened[0]), *map(at, opened)])
+        assert found is None
+        assert warning.startswith(f"their EXIF says f/{opened[0]:.3g} to f/{opened[1]:.3g},")
 
 
 def test_what_is_too_far_out_of_focus_is_said_of_each_and_of_most(taken: list[SheetPhoto]) -> None:

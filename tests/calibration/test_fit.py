@@ -186,6 +186,15 @@ def test_a_focus_distance_that_one_side_does_not_tell_is_not_doubted() -> None:
     assert near.warnings[0].startswith("all circles are on one side")
 
 
+def test_pictures_in_focus_are_on_no_side_of_it() -> None:
+    some = circles((0.5, 0.55, 0.6, 0.65, 0.7, 2.0), error=0.005)
+    is_focused = some.picture == 5
+    some = replace(some, blur_px=np.where(is_focused, GAMMA, some.blur_px), is_focused=is_focused)
+    assert any("all circles are nearer than" in warning for warning in fit_constants(some, resamples=10).warnings)
+    given = fit_constants(some, 1.3 * FOCUS, resamples=10)
+    assert any("on one side" in warning or "photographs say" in warning for warning in given.warnings)
+
+
 def test_a_focus_distance_that_one_side_tells_well_is_held_against_the_given_one() -> None:
     near = circles((0.5, 0.6, 0.7, 0.8, 0.9, 1.0), error=0.002)
     wrong = fit_constants(near, 1.1 * FOCUS, resamples=20)
