@@ -30,7 +30,7 @@ def circle(
     along, across = u * math.cos(turn) + v * math.sin(turn), v * math.cos(turn) - u * math.sin(turn)
     fine = 0.9 - 0.85 * ((along / radius) ** 2 + (across / (radius * axes_ratio)) ** 2 < 1)
     if soft_px:
-        fine = cv2.GaussianBlur(fine, (0, 0), soft_px * FINE)
+        fine = np.asarray(cv2.GaussianBlur(fine, (0, 0), soft_px * FINE), np.float64)
     return np.asarray(fine.reshape(SIZE, FINE, SIZE, FINE).mean((1, 3)), np.float32)
 
 

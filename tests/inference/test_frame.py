@@ -370,7 +370,8 @@ def test_intrinsics_of_another_size_are_told_by_where_their_axis_is(ratio: float
 def test_an_axis_an_eighth_off_the_middle_one_way_is_told(off_px: tuple[int, int]) -> None:
     camera = Camera(1280, 960, 2.0, 3.8, intrinsics=Intrinsics.centred(900.0, 1280, 960))
     for part, is_told in ((0.85, False), (1.0, True)):
-        cropped = camera.cropped(*(round(part * px) for px in off_px), 1280, 960)
+        left, top = (round(part * px) for px in off_px)
+        cropped = camera.cropped(left, top, 1280, 960)
         assert len([*maybe_of_another_size(cropped)]) == is_told
 
 
