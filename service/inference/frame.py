@@ -12,10 +12,6 @@ from service.metres import focus_in_words
 from service.optics import thin_lens
 from service.optics.camera import AS_INFINITY_M, FOCUS_DISTANCES_M, Camera, Intrinsics, Lens
 
-A_REGION = (
-    "a region that the sensor reads out is a camera of its own, of that size, with k_cam_px as it is (by lens specs, "
-    "sensor_width_px is the region's)"
-)
 FocalLengthFrom = Literal["camera", "exif"]
 
 LENS_TOLERANCE = 0.05
@@ -58,7 +54,8 @@ def camera_of(photograph: Photograph, camera: Camera) -> tuple[Camera, tuple[str
         advice = (
             "send the original, whose EXIF says how the camera was held, or register a camera of that size"
             if is_turned
-            else f"send the whole frame, not a crop; {A_REGION}"
+            else "send the whole frame, not a crop; a region that the sensor reads out is a camera of its own, of that "
+            "size, with k_cam_px as it is (by lens specs, sensor_width_px is the region's)"
         )
         raise ImageSizeMismatch(
             f"The photograph has {width_px}x{height_px} pixels upright, the camera "
@@ -71,7 +68,7 @@ def camera_of(photograph: Photograph, camera: Camera) -> tuple[Camera, tuple[str
         f"the photograph has {width_px}x{height_px} pixels and the camera "
         f"{fitting.image_width_px}x{fitting.image_height_px}: "
         f"k_cam_px {resized.k_cam_px:.4g} and gamma_px {resized.gamma_px:.4g} were scaled to it, as of "
-        f"the whole frame resized, but {A_REGION}"
+        "the whole frame resized: a region that the sensor reads out is a camera of its own"
     )
     return resized, (*unlikely, warning)
 
