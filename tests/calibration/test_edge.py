@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from model_export.render import DISC, GAUSSIAN, PointSpread, blur
 from service.calibration.edge import EdgeError, find_spread, fit_again, fit_edge, slice_blur
+from service.calibration.edge import PointSpread as FittedSpread
 from service.opencv import cv2
+from service.optics import thin_lens
 
 SIZE = 128
 FINE = 8
@@ -160,3 +162,14 @@ def test_a_lens_whose_most_blurred_circles_tell_its_point_spread_is_read_right_t
 def test_a_narrow_ellipse_is_too_tilted() -> None:
     with pytest.raises(EdgeError, match="too tilted"):
         fit_edge(photographed(circle(30, axes_ratio=0.36), 1.5, GAUSSIAN), 64, 64, 20)
+
+
+@pytest.mark.parametrize("radius_px", [7.0, 24.0])
+def test_a_soft_rim_is_that_of_a_circle(radius_px: float) -> None:
+    """A Gaussian draws a round edge in, which a straight one's rim would have as a circle 0.1 px smaller."""
+    softness = math.hypot(1.2, math.sqrt(thin_lens.PIXEL_BOX_VARIANCE))
+    light = photographed(circle(radius_px), 1.0, DISC)
+    edge = fit_edge(photographed(light, 1.2, GAUSSIAN), 63, 65, radius_px)
+    found = fit_again(edge, FittedSpread("disc", softness))
+    assert found.radius_px == pytest.approx(radius_px, abs=0.01)
+    assert found.blur_px == pytest.approx(math.hypot(1.0, softness), rel=0.01)
