@@ -128,12 +128,15 @@ def radii_px(grid: CircleGrid, centres_px: Array) -> Array:
     """About how large each circle is in the picture: the geometric mean of its semi-axes [n]."""
     points = grid.points_mm()
     matrix = homography(points, centres_px)
-    step = grid.diameter_mm / 8
-    right, down = np.array([step, 0.0]), np.array([0.0, step])
-    across = projected(matrix, points + right) - projected(matrix, points - right)
-    along = projected(matrix, points + down) - projected(matrix, points - down)
-    area = np.abs(across[:, 0] * along[:, 1] - across[:, 1] * along[:, 0]) / (2 * step) ** 2
-    return np.asarray(np.sqrt(area) * grid.diameter_mm / 2)
+    return radii_through(lambda at: projected(matrix, at), points, grid.diameter_mm)
+
+
+def radii_through(seen: Callable[[Array], Array], points_mm: Array, diameter_mm: float) -> Array:
+    """The same of circles about points [n,2] of the sheet, by a map of places [n,2] on it (mm) to pixels [n,2]."""
+    right, down = np.eye(2) * diameter_mm / 8
+    across, along = (seen(points_mm + step) - seen(points_mm - step) for step in (right, down))
+    area = np.abs(across[:, 0] * along[:, 1] - across[:, 1] * along[:, 0])
+    return np.asarray(2 * np.sqrt(area))
 
 
 def _find(grey: NDArray[np.uint8], grid: CircleGrid, check: Callable[[], None]) -> FoundGrid:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from service.calibration.grid import homography, projected
+from service.calibration.grid import homography, projected, radii_through
 from service.calibration.measure import Measured
 from service.calibration.target import CircleGrid
 
@@ -21,7 +21,6 @@ LEAST_SPREAD = 0.02  # of blur, in radii: a standard deviation below which growt
 CERTAIN = 2.0  # standard errors, as if a photograph told as much as one circle
 CUBIC = [(i, j) for i in range(4) for j in range(4 - i)]  # powers along the sheet and across it
 LEAST_CIRCLES = 2 * len(CUBIC)  # of a photograph that tells how large its circles are
-STEP = 1e-3  # of the sheet's half
 
 
 def otherwise_toned(grid: CircleGrid, measured: Sequence[Measured]) -> tuple[str, ...]:
@@ -57,18 +56,15 @@ def radii_by_middles(grid: CircleGrid, circles: Sequence[int], centres_px: Array
     The sheet goes into the picture by a homography and what a cubic adds to it: distortion, a bend.
     """
     points = grid.points_mm()[list(circles)]
-    half_mm = float(np.abs(points - points.mean(0)).max())
-    places = (points - points.mean(0)) / half_mm
-    flat = homography(places, centres_px)
-    added = np.linalg.lstsq(_powers(places), centres_px - projected(flat, places), rcond=None)[0]
+    middle = points.mean(0)
+    half_mm = float(np.abs(points - middle).max())
+    flat = homography(points, centres_px)
+    added = np.linalg.lstsq(_powers((points - middle) / half_mm), centres_px - projected(flat, points), rcond=None)[0]
 
     def seen(at: Array) -> Array:
-        return np.asarray(projected(flat, at) + _powers(at) @ added)
+        return np.asarray(projected(flat, at) + _powers((at - middle) / half_mm) @ added)
 
-    right, down = np.eye(2) * STEP
-    across, along = (seen(places + step) - seen(places - step) for step in (right, down))
-    area = np.abs(across[:, 0] * along[:, 1] - across[:, 1] * along[:, 0]) / (2 * STEP * half_mm) ** 2
-    return np.asarray(np.sqrt(area) * grid.diameter_mm / 2)
+    return radii_through(seen, points, grid.diameter_mm)
 
 
 def _powers(at: Array) -> Array:
