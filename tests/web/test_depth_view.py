@@ -175,8 +175,9 @@ def shot(place: Locator) -> Float:
 
 
 def scroll(page: Page, over: Locator) -> None:
-    """Move the page by a finger that begins on something."""
+    """Move the page by a finger that begins on something, until it rests: a tap before that would only stop it."""
     over.evaluate("(one) => one.addEventListener('pointercancel', () => (window.isScrolled = true))")
+    page.evaluate("document.addEventListener('scrollend', () => (window.isAtRest = true), { once: true })")
     box = over.bounding_box()
     assert box is not None
     x, y = box["x"] + 0.3 * box["width"], box["y"] + 0.9 * box["height"]
@@ -184,7 +185,7 @@ def scroll(page: Page, over: Locator) -> None:
     for kind, moved in (("Start", 0), ("Move", 10), ("Move", 30), ("Move", 60), ("Move", 90)):
         fingers.send("Input.dispatchTouchEvent", {"type": f"touch{kind}", "touchPoints": [{"x": x, "y": y - moved}]})
     fingers.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
-    page.wait_for_function("window.isScrolled")
+    eventually(page, lambda: bool(page.evaluate("window.isScrolled && window.isAtRest")))
 
 
 def tasks_ms(trace: bytes) -> Float:
